@@ -1,13 +1,12 @@
-"""What a file held: the mesh in working space, its materials, and how to find the way back to the file.
+"""The content of a mesh file: the mesh in working space, its materials, and the record for writing back.
 
 UVs of `Mesh.corner_uvs`: v up, and every consumer takes them **modulo 1** (textures repeat). Reading shifts whole UV
-islands by integers, so that they lie in the unit square; an island that fits the square but crosses its border (a
-spot whose u runs from -0.05 to 0.99) keeps its place and its faces stay whole, so single coordinates may lie
-anywhere in [-1, 2]. What a rasteriser paints outside the square belongs to the texel on the other side, and a
-texture fetch wraps. A new unwrapping never leaves the square.
+islands by integers into the unit square. An island that fits the square but crosses its border (u from -0.05 to 0.99)
+keeps its place, and its faces stay whole. So single coordinates may lie anywhere in [-1, 2]. A fragment outside the
+square belongs to the texel on the other side, and a texture fetch wraps. A new unwrapping never leaves the square.
 
 Faces may share texels (stacked or mirrored shells, instances of one glTF mesh): the face that comes first in
-`Mesh.faces` is the one to paint and to measure from; the others show the same texels.
+`Mesh.faces` is painted and measured; the others show the same texels.
 """
 
 from dataclasses import dataclass
@@ -19,17 +18,17 @@ from jaxtyping import Float
 
 from mistyle.core.mesh import Mesh
 
-TURNED = "turned from Z up to Y up"  # stands in a note of every mesh that reading has turned
+TURNED = "turned from Z up to Y up"  # part of the note of every mesh that reading has turned
 # Rows and columns as the file stores them, or as a viewer shows the picture (EXIF orientation).
 Pixels = Literal["stored", "upright"]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image file, decoded: sRGB-encoded Rec.709, 0..1, upright (row 0 is the top) unless asked for otherwise.
+    """An image file, decoded: sRGB-encoded Rec.709, 0..1, upright (row 0 is the top) unless requested otherwise.
 
     `alpha` is linear coverage 0..1, or None when the file is opaque; rgb is not premultiplied. `notes` are sentences
-    about what was converted on the way in.
+    about conversions while reading.
     """
 
     rgb: Float[np.ndarray, "h w 3"]
@@ -40,20 +39,20 @@ class Picture:
 
 @dataclass(frozen=True)
 class Shading:
-    """What a material says besides albedo, normal, roughness and metalness. Pictures of the file show it; the views
-    that are painted do not.
+    """The material's properties besides albedo, normal, roughness and metalness. Pictures of the file show them;
+    painted views do not.
 
     opacity         factor of the coverage, 0..1
-    cutoff          coverage at or above it is whole and below it nothing (glTF: MASK); None: blended
+    cutoff          coverage threshold: opaque at or above it, else transparent (glTF: MASK); None: blended
     emission        factor of the emitted radiance, linear Rec.709, >= 0, unbounded
     specular        factor of the dielectric's reflectance at normal incidence (F0), linear Rec.709, 0..1
     edge            factor of its reflectance at grazing incidence (F90), 0..1
     coat            weight of a clear coat of index 1.5, 0..1; coat_roughness its perceptual roughness
     transmission    share of the dielectric's diffuse part that is transmitted, 0..1; ior the index, thin: no volume
-    unlit           albedo is what is seen, in whatever light
-    black           the albedo stands for the emission: as a surface the material is black
-    stated          "colour": the file leaves metalness and roughness open, and glTF's default, rough metal, is drawn;
-                    "nothing": there is no material at all, and a matt grey of 0.8 is drawn, as Blender does
+    unlit           the albedo is displayed without lighting
+    black           the albedo holds the emission; the material reflects nothing
+    stated          "colour": the file sets no metalness and roughness, and glTF's default, rough metal, is drawn;
+                    "nothing": the file has no material, and a matt grey of 0.8 is drawn, as in Blender
     """
 
     opacity: float = 1.0
@@ -77,7 +76,7 @@ class Material:
 
     The maps are as stored, factors not yet applied: the surface's albedo is `albedo * albedo_factor`, its roughness
     `roughness * roughness_factor`, its metallic `metallic * metallic_factor`, with 1 where a map is None. They belong
-    to `Mesh.corner_uvs`: reading has carried them over where the mesh was unwrapped anew.
+    to `Mesh.corner_uvs`: reading has resampled them where the mesh was unwrapped anew.
 
     albedo     linear Rec.709, 0..1
     normal     unit tangent-space normal, +Y, the file's normal scale applied
@@ -86,7 +85,7 @@ class Material:
     opacity    coverage, linear, 0..1
     emission   linear Rec.709, 0..1
     specular   linear Rec.709, 0..1
-    shading    the factors of the last three, and what has no maps
+    shading    the factors of the last three, and properties without maps
     """
 
     name: str
@@ -105,7 +104,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Primitive:
-    """Faces start:stop of `Mesh.faces` and the place in the file that they came from; -1 where there is no such thing.
+    """Faces start:stop of `Mesh.faces` and their origin in the file; -1 where the file has no such index.
 
     `texcoord` is the index of the TEXCOORD set that `Source.old_uvs` were read from (-1: none). `part` is the texture
     set, or -1 when the faces land in several UDIM tiles and `Mesh.part` decides face by face. On glTF
@@ -128,7 +127,7 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Source:
-    """Where an asset came from and how to write back to it.
+    """The file of an asset, and the data for writing back to it.
 
     primitives      in face order, together they cover `Mesh.faces`
     user_positions  `Mesh.positions` in the file's own units and axes, same order (glTF: world space, node transforms

@@ -1,4 +1,4 @@
-"""Cameras, their frames and the pixel convention; the paper's rig of 16 and the order in which it is visited.
+"""Cameras, their frames and the pixel convention; the paper's rig of 16 views and its visiting order.
 
 Camera axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5: the centre of the first pixel
 is (0.5, 0.5), the bottom right corner of the image is (width, height). The world is right-handed with Y up.
@@ -21,8 +21,8 @@ MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 class Camera:
     """A pinhole camera with square pixels.
 
-    `world_from_cam` is a rigid motion (OpenCV axes), `focal` and `centre` are in pixels, `size` is (height, width),
-    azimuth and elevation (degrees) name the view and are NaN where they have no meaning.
+    `world_from_cam` is a rigid motion (OpenCV axes), `focal` and `centre` are in pixels, `size` is (height, width).
+    Azimuth and elevation (degrees) name the view and are NaN where undefined.
     """
 
     world_from_cam: Float[np.ndarray, "4 4"]
@@ -48,7 +48,7 @@ class Camera:
 
     @property
     def fov(self) -> float:
-        """Horizontal field of view in degrees (of the full width; exact only where the centre is the middle)."""
+        """Horizontal field of view in degrees (of the full width; exact only for a centred principal point)."""
         return float(np.degrees(2 * np.arctan(self.size[1] / (2 * self.focal))))
 
 
@@ -65,7 +65,7 @@ def look_at(
     forward = aim - eye
     length = np.linalg.norm(forward)
     if not np.isfinite(length) or length < 1e-9:
-        raise ValueError(f"camera '{name}' stands on its target {aim.tolist()}; move it away")
+        raise ValueError(f"camera '{name}' coincides with its target {aim.tolist()}; move it away")
     forward /= length
     # Within 0.5 degrees of a pole the cross product with Y loses its direction; the heading is then taken as -Z.
     up = np.array([0.0, 1.0, 0.0]) if abs(forward[1]) < np.cos(np.radians(0.5)) else np.array([0.0, 0.0, -1.0])
@@ -93,8 +93,8 @@ PAPER_ANGLES = tuple((30.0 * k, 0.0) for k in range(1, 13)) + tuple((30.0, e) fo
 def rig(settings: RigSettings) -> list[Camera]:
     """The cameras of a job in visiting order; 'paper' gives the 16 views of section 4.1.1, 'turntable' a ring.
 
-    Cameras of kind 'file' are read by `io/cameras/camera_files.py`, since this floor opens no files; those of kind
-    'nbv' hang on the mesh (`render/mitsuba/rigs.py`).
+    Cameras of kind 'file' are read by `io/cameras/camera_files.py`, since `core` opens no files; those of kind
+    'nbv' depend on the mesh (`render/mitsuba/rigs.py`).
     """
     if settings.kind == "file":
         raise ValueError("cameras from a file are read by mistyle.io.cameras.camera_files.read_cameras")
@@ -116,22 +116,23 @@ def visiting_order(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def angular_order(cameras: Sequence[Camera]) -> list[int]:
-    """Indices of `cameras` from the first on, each time the one least turned from any already taken.
+    """Indices of `cameras` from the first on; each next camera has the least angle to any already chosen.
 
-    Angles are those between camera positions seen from the origin; of equals (within 0.01 degrees) the one least turned
-    from the first comes first, then the earlier. The paper's rig is so walked both ways round and closes at the back.
+    Angles are those between camera positions seen from the origin. Ties (within 0.01 degrees) go to the least angle
+    from the first camera, then to the lower index. The paper's rig is so visited both ways round and closes at the
+    back.
     """
     towards = np.array([c.position / np.linalg.norm(c.position) for c in cameras])
-    turned = np.round(np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1))), 2)
-    order, left = [0], list(range(1, len(cameras)))
-    while left:
-        order.append(min(left, key=lambda k: (turned[k, order].min(), turned[k, order[0]], k)))
-        left.remove(order[-1])
+    angles = np.round(np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1))), 2)
+    order, remaining = [0], list(range(1, len(cameras)))
+    while remaining:
+        order.append(min(remaining, key=lambda k: (angles[k, order].min(), angles[k, order[0]], k)))
+        remaining.remove(order[-1])
     return order[: len(cameras)]
 
 
 def by_camera(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Indices of cameras that differ in nothing but their name: pictures from one place with one lens."""
+    """Groups of indices of cameras that are equal but for their names: pictures from one place with one lens."""
     groups: dict[tuple, list[int]] = {}
     for k, camera in enumerate(cameras):
         key = (camera.world_from_cam.tobytes(), camera.focal, camera.centre, camera.size)
@@ -185,12 +186,12 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def binned(camera: Camera, by: int) -> Camera:
-    """The camera whose pixels are blocks of `by` x `by`; what is left over at the right and the bottom is dropped."""
+    """The camera whose pixels are blocks of `by` x `by`; the remainder at the right and the bottom is dropped."""
     size = (camera.size[0] // by, camera.size[1] // by)
     centre = (camera.centre[0] / by, camera.centre[1] / by)
     return replace(camera, focal=camera.focal / by, centre=centre, size=size)
 
 
 def in_frame(camera: Camera, px: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
-    """Which pixel coordinates lie inside the image."""
+    """Mask of the pixel coordinates inside the image."""
     return (px[..., 0] >= 0) & (px[..., 1] >= 0) & (px[..., 0] < camera.size[1]) & (px[..., 1] < camera.size[0])

@@ -1,4 +1,4 @@
-"""Reference pictures: what known cameras saw under known lights. What a material is fitted to."""
+"""Reference pictures with known cameras and lights: the data of the material fit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ Loaded = tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]
 class Captures:
     """n pictures of one object, in working units; the pixels are loaded one picture at a time.
 
-    cameras  where each was taken from; their names are the pictures' names
-    lights   what lit each picture
-    load     picture k: linear Rec.709 radiance (already divided by its exposure), and which pixels count (inside the
-             user's mask, finite, not saturated); pixels beside the mesh may be marked as counting and are ignored
+    cameras  camera of each picture; their names are the pictures' names
+    lights   lights of each picture
+    load     picture k: linear Rec.709 radiance (divided by its exposure), and the mask of valid pixels (inside the
+             user's mask, finite, not saturated); pixels beside the mesh may be marked valid and are ignored
     """
 
     cameras: tuple[Camera, ...]
@@ -36,7 +36,7 @@ def in_memory(
     pictures: Sequence[Float[np.ndarray, "h w 3"]],
     masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> Captures:
-    """Captures of pictures that are at hand; without masks every finite pixel counts."""
+    """Captures of pictures in memory; without masks every finite pixel is valid."""
     if not len(cameras) == len(lights) == len(pictures):
         raise ValueError(f"{len(cameras)} cameras, {len(lights)} lights and {len(pictures)} pictures do not match")
 
@@ -49,7 +49,7 @@ def in_memory(
 
 
 def subset(captures: Captures, chosen: Sequence[int]) -> Captures:
-    """Some of the pictures, in the given order."""
+    """A subset of the pictures, in the order of `chosen`."""
     rows = [int(k) for k in chosen]
     return Captures(
         tuple(captures.cameras[k] for k in rows),
@@ -61,17 +61,17 @@ def subset(captures: Captures, chosen: Sequence[int]) -> Captures:
 def shrunk(captures: Captures, by: Sequence[int]) -> Captures:
     """Picture k with blocks of by[k] x by[k] pixels averaged.
 
-    A block counts when all its pixels do. What is left over at the right and the bottom is dropped.
+    A block is valid when all its pixels are. The remainder at the right and the bottom is dropped.
     """
-    cameras = tuple(binned(camera, times) for camera, times in zip(captures.cameras, by, strict=True))
+    cameras = tuple(binned(camera, factor) for camera, factor in zip(captures.cameras, by, strict=True))
 
     def load(k: int) -> Loaded:
-        (rgb, counts), times = captures.load(k), by[k]
-        if times == 1:
-            return rgb, counts
+        (rgb, valid), factor = captures.load(k), by[k]
+        if factor == 1:
+            return rgb, valid
         height, width = cameras[k].size
-        rgb, counts = rgb[: height * times, : width * times], counts[: height * times, : width * times]
-        means = rgb.reshape(height, times, width, times, 3).mean(axis=(1, 3))
-        return means.astype(np.float32), np.asarray(counts.reshape(height, times, width, times).all(axis=(1, 3)))
+        rgb, valid = rgb[: height * factor, : width * factor], valid[: height * factor, : width * factor]
+        means = rgb.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
+        return means.astype(np.float32), np.asarray(valid.reshape(height, factor, width, factor).all(axis=(1, 3)))
 
     return Captures(cameras, captures.lights, load)

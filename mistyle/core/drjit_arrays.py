@@ -1,8 +1,8 @@
-"""NumPy's memory as Dr.Jit may read it.
+"""NumPy arrays whose memory Dr.Jit can read safely.
 
-On the CPU Dr.Jit takes over NumPy's (and torch's) memory in place and walks through it in whole vectors: a kernel
-reads the last vector to its end even where the array ends before, and dies where nothing is mapped behind it. It also
-compiles the memory's alignment into its kernels. So nothing goes from NumPy to Dr.Jit but through these.
+On the CPU Dr.Jit uses NumPy's (and torch's) memory in place and reads it in whole vectors. A kernel reads the last
+vector to its end, beyond a shorter array, and crashes where no page is mapped behind it. Dr.Jit also compiles the
+memory's alignment into its kernels. So every NumPy array passes through these functions on its way to Dr.Jit.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ ALIGNMENT = 64
 def aligned(values: Any, kind: Any = np.float32) -> np.ndarray:
     """A copy that starts at a multiple of 64 bytes and that may be read to the end of its last vector.
 
-    Arrays that happen to start elsewhere would be another kernel in every call.
+    Arrays of varying alignment would compile another kernel in every call.
     """
     values = np.asarray(values)
     kind = np.dtype(kind)
@@ -29,6 +29,6 @@ def aligned(values: Any, kind: Any = np.float32) -> np.ndarray:
 
 
 def whole(values: Any, kind: Any = np.float32) -> np.ndarray:
-    """The values without a copy where they fill whole vectors already: for pictures too large to have twice."""
+    """The values without a copy where they fill whole vectors already: for pictures too large to copy."""
     values = np.ascontiguousarray(values, kind)
     return values if values.size % LANES == 0 else aligned(values, kind)

@@ -1,8 +1,8 @@
-"""One exception type per kind of trouble a user can meet; each carries the exit code of the command line."""
+"""Exceptions for user-visible failures; each carries the exit code of the command line."""
 
 
 class MistyleError(Exception):
-    """Something went wrong that the message explains: what came, what was expected, what to do."""
+    """A failure whose message names the input found, the input expected and the fix."""
 
     exit_code = 1
 
@@ -26,6 +26,6 @@ class EnvironmentMissing(MistyleError):
 
 
 class Stopped(MistyleError):
-    """The run was asked to stop; running the same command again goes on from the last finished stage."""
+    """The run stopped on request; rerun to resume after the last finished stage."""
 
     exit_code = 75

@@ -35,7 +35,7 @@ def luminance(linear: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
 def bilinear(
     image: Float[np.ndarray, "h w *c"], px: Float[np.ndarray, "n 2"], edge: Literal["clamp", "repeat"] = "clamp"
 ) -> Float[np.ndarray, " n *c"]:
-    """Values of `image` at pixel coordinates `px`; beyond the border it is continued by its edge or repeated."""
+    """Values of `image` at pixel coordinates `px`; beyond the border its edge is extended or the image repeats."""
     height, width = image.shape[:2]
     low = np.floor(px - 0.5)
     tx, ty = ((px - 0.5) - low).astype(np.float32).T
@@ -54,7 +54,7 @@ def resize(
     image: Float[np.ndarray, "h w *c"], size: tuple[int, int], edge: Literal["clamp", "repeat"] = "clamp"
 ) -> Float[np.ndarray, "H W *c"]:
     """Resample to `size` (height, width): the mean over each new pixel's area where the picture shrinks along both
-    sides, else bilinear; `edge` says what lies beyond the border."""
+    sides, else bilinear; `edge` sets the values beyond the border."""
     if image.shape[:2] == size:
         return image.astype(np.float32, copy=True)
     if size[0] <= image.shape[0] and size[1] <= image.shape[1]:
@@ -73,14 +73,14 @@ def resized_rows(
 
 
 def _stretch(image: np.ndarray, axis: int, count: int, edge: str, part: slice = slice(None)) -> np.ndarray:
-    """Linear interpolation along one axis to `count` pixels, of which `part` is made."""
-    have = image.shape[axis]
-    x = (np.arange(count)[part] + 0.5) * have / count - 0.5
+    """Linear interpolation along one axis to `count` pixels; computes only `part` of them."""
+    size = image.shape[axis]
+    x = (np.arange(count)[part] + 0.5) * size / count - 0.5
     low = np.floor(x).astype(np.int64)
     shape = [1] * image.ndim
     shape[axis] = len(x)
     t = (x - low).astype(np.float32).reshape(shape)
-    first, second = (k % have if edge == "repeat" else np.clip(k, 0, have - 1) for k in (low, low + 1))
+    first, second = (k % size if edge == "repeat" else np.clip(k, 0, size - 1) for k in (low, low + 1))
     result, rest = image.take(first, axis=axis), image.take(second, axis=axis)
     result *= 1 - t
     rest *= t
@@ -114,7 +114,7 @@ def erode(mask: Bool[np.ndarray, "h w"], radius: int) -> Bool[np.ndarray, "h w"]
 def dilate_within(mask: Bool[np.ndarray, "h w"], label: Int[np.ndarray, "h w"], radius: int) -> Bool[np.ndarray, "h w"]:
     """`dilate` that stays inside regions: a pixel joins when a mask pixel of its own label (>= 0) is in its window.
 
-    The window's highest and lowest masked labels are looked at; a third label between them in one window is missed.
+    The window's highest and lowest masked labels are compared; a third label between them in one window is missed.
     """
     if radius <= 0:
         return mask & (label >= 0)
@@ -172,7 +172,7 @@ def distance_to(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Distance of every pixel's centre to that of the nearest mask pixel, in pixels; infinite where there is none."""
     if not mask.any():
         return np.full(mask.shape, np.inf, np.float32)
-    # Intel's version takes its roots according to where in memory the result happens to lie: its last bit is chance.
+    # Intel's version chooses its square root by the result's memory alignment: its last bit varies.
     used = cv2.ipp.useIPP()
     cv2.ipp.setUseIPP(False)  # of this thread only
     try:
@@ -194,9 +194,9 @@ def match_histogram(
     share = np.linspace(0, 1, knots)
     result = values.astype(np.float32, copy=True)
     for channel in range(values.shape[1]):
-        here, which = np.unique(np.quantile(values[:, channel], share), return_inverse=True)
-        there = np.bincount(which, np.quantile(target[:, channel], share)) / np.bincount(which)
-        moved = np.interp(values[:, channel], here, there)
+        levels, which = np.unique(np.quantile(values[:, channel], share), return_inverse=True)
+        target_levels = np.bincount(which, np.quantile(target[:, channel], share)) / np.bincount(which)
+        moved = np.interp(values[:, channel], levels, target_levels)
         result[:, channel] += np.float32(strength) * (moved.astype(np.float32) - result[:, channel])
     return result
 

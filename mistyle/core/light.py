@@ -18,8 +18,8 @@ is enough. "frame" is "world" where it is left out, "turn" 0 and "scale" 1.
 Directions and axes are unit vectors that point TOWARDS the light. Colours are linear Rec.709. `irradiance` is what a
 surface that faces the light receives; a point light of `intensity` i at distance d gives irradiance i / d²; one at the
 camera's origin is a co-located flash; `radiance` arrives from every direction; an environment is a latitude-longitude
-picture of linear radiance times `scale`, laid out as `environment_directions` says and then turned by `turn` degrees
-about +Y (from +Z towards +X), its file (.exr or .hdr) is found beside `lights.json`; a spherical Gaussian (world
+picture of linear radiance times `scale` in the layout of `environment_directions`, turned by `turn` degrees about +Y
+(from +Z towards +X); its file (.exr or .hdr) lies beside `lights.json`; a spherical Gaussian (world
 frame) sends amplitude · exp(sharpness · (axis · w - 1)) from direction w; "scene" means that only the named Mitsuba
 scene file describes the light. The world is the cameras' world, and lengths are in its units.
 """
@@ -72,8 +72,7 @@ class Point:
 class Environment:
     """Light from infinitely far, by a latitude-longitude map of linear radiance (rows of `environment_directions`).
 
-    `turn` degrees about +Y, from +Z towards +X, turn the map's world with everything in it. `file` is where it came
-    from, for `lights.json`.
+    `turn` rotates the map about +Y by degrees, from +Z towards +X. `file` is its source, for `lights.json`.
     """
 
     radiance: Float[np.ndarray, "eh ew 3"]
@@ -129,8 +128,8 @@ def has_soft(many: Iterable[Lights]) -> bool:
 def lights(name: str) -> Lights:
     """The lights of a scene of ours: "paper", "phase1", "phase2", or any other template's name or scene file.
 
-    The numbers stand once: the paper's three spherical Gaussians in `scenes/paper_lights.json`, the lights of both fit
-    phases in their scene files. Every other scene is named by its file.
+    The numbers are stored once: the paper's three spherical Gaussians in `scenes/paper_lights.json`, the lights of both
+    fit phases in their scene files. Every other scene is named by its file.
     """
     if name in ("paper", "paper_views"):
         return from_json(json.loads((scenes() / "paper_lights.json").read_text(encoding="utf-8")), "paper_lights.json")
@@ -148,7 +147,7 @@ def direction_in_world(light: Directional, camera: Camera) -> Float[np.ndarray, 
 
 
 def position_in_world(light: Point, camera: Camera) -> Float[np.ndarray, "3"]:
-    """Where a point light stands in the world, for one fixed to the world or to `camera`."""
+    """World position of a point light that is fixed to the world or to `camera`."""
     position = np.asarray(light.position, float)
     return camera.world_from_cam[:3, :3] @ position + camera.position if light.frame == "camera" else position
 
@@ -220,7 +219,7 @@ def from_json(data: dict[str, Any], where: str = "lights.json", load: Load | Non
     """The lights of `lights.json`'s content; InputRefused names the entry that is wrong. Directions are normalised.
 
     `load` reads the file that an environment names; without it environments are refused. Lights of single views are
-    not looked at (`lights_of_views`).
+    ignored here (`lights_of_views`).
     """
     return _list(data.get("lights"), f"{where}: lights", load)
 
@@ -237,10 +236,10 @@ def lights_of_views(
     if not isinstance(own, dict):
         raise InputRefused(f'{where}: "views" is a {type(own).__name__}; expected an object: view name -> [lights].')
     common = from_json(data, where, load) if "lights" in data or not own else None
-    strange = sorted(set(own) - set(names))
-    if strange and common is not None:
+    unknown = sorted(set(own) - set(names))
+    if unknown and common is not None:
         raise InputRefused(
-            f'{where}: "views" names {strange[0]!r}, which is none of the {len(names)} views ({names[0]!r}, ...). '
+            f'{where}: "views" names {unknown[0]!r}, which is not one of the {len(names)} views ({names[0]!r}, ...). '
             "Write the view's name as in the camera file."
         )
     missing = [name for name in names if name not in own]
@@ -287,18 +286,18 @@ def _light(entry: Any, where: str, load: Load | None) -> Light:
     if kind == "spherical_gaussian":
         sharpness = entry.get("sharpness")
         if not _number(sharpness) or not 0 <= sharpness < 1e6:
-            raise InputRefused(f"{where}: sharpness is {_said(sharpness)}; expected a number from 0 to a million.")
+            raise InputRefused(f"{where}: sharpness is {_quoted(sharpness)}; expected a number from 0 to a million.")
         axis, amplitude = _unit(entry, "axis", where), _triple(entry, "amplitude", where, 0.0)
         return SphericalGaussian(axis, float(sharpness), amplitude)
     if kind == "scene" and isinstance(entry.get("file"), str):
         return SceneLights(entry["file"])
-    raise InputRefused(f"{where}: type is {_said(kind)}; expected one of {', '.join(NAMES.values())}.")
+    raise InputRefused(f"{where}: type is {_quoted(kind)}; expected one of {', '.join(NAMES.values())}.")
 
 
 def _frame(entry: dict, where: str) -> Literal["world", "camera"]:
     frame = entry.get("frame", "world")
     if frame not in ("world", "camera"):
-        raise InputRefused(f'{where}: frame is {_said(frame)}; expected "world" or "camera".')
+        raise InputRefused(f'{where}: frame is {_quoted(frame)}; expected "world" or "camera".')
     return frame
 
 
@@ -306,10 +305,10 @@ def _environment(entry: dict, where: str, load: Load | None) -> Environment:
     file, turn, scale = entry.get("file"), entry.get("turn", 0.0), entry.get("scale", 1.0)
     if not isinstance(file, str) or not file or load is None:
         expected = "lights without files here" if load is None else "the name of an .exr or .hdr beside lights.json"
-        raise InputRefused(f"{where}: file is {_said(file)}; expected {expected}.")
+        raise InputRefused(f"{where}: file is {_quoted(file)}; expected {expected}.")
     if not _number(turn) or not _number(scale) or scale < 0:
         raise InputRefused(
-            f"{where}: turn is {_said(turn)}, scale is {_said(scale)}; expected degrees and a number >= 0."
+            f"{where}: turn is {_quoted(turn)}, scale is {_quoted(scale)}; expected degrees and a number >= 0."
         )
     return Environment(load(file), float(turn), float(scale), file)
 
@@ -318,12 +317,12 @@ def _triple(entry: dict, key: str, where: str, least: float = -math.inf) -> Vect
     value = entry.get(key)
     if not isinstance(value, list) or len(value) != 3 or not all(_number(v) and v >= least for v in value):
         expected = f"three finite numbers{' >= 0' if least == 0 else ''}"
-        raise InputRefused(f"{where}: {key} is {_said(value)}; expected {expected}.")
+        raise InputRefused(f"{where}: {key} is {_quoted(value)}; expected {expected}.")
     return (float(value[0]), float(value[1]), float(value[2]))
 
 
-def _said(value: Any) -> str:
-    """A file's value as a sentence can hold it."""
+def _quoted(value: Any) -> str:
+    """A file's value, shortened for an error message."""
     return reprlib.repr(value)[:120]
 
 
@@ -336,14 +335,14 @@ def _unit(entry: dict, key: str, where: str) -> Vector:
     length = math.hypot(*vector)
     if not 1e-9 <= length < 1e150:
         raise InputRefused(f"{where}: {key} has the length {length:g}; expected a direction.")
-    # What is a unit vector already keeps its bits, so that writing and reading again changes nothing.
+    # A unit vector keeps its bits, so that writing and reading again changes nothing.
     x, y, z = (vector if abs(length - 1) < 1e-12 else vector / length).tolist()
     return (x, y, z)
 
 
 def _numbers(element: ElementTree.Element, tag: str, name: str) -> list[float]:
-    found = element.find(f"{tag}[@name='{name}']")
-    values = [float(v) for v in (found.get("value", "") if found is not None else "").replace(",", " ").split()]
+    child = element.find(f"{tag}[@name='{name}']")
+    values = [float(v) for v in (child.get("value", "") if child is not None else "").replace(",", " ").split()]
     return values * 3 if len(values) == 1 else values
 
 
@@ -361,7 +360,7 @@ def _lights_of_xml(path: Path) -> Lights:
             red, green, blue = _numbers(emitter, "rgb", "radiance")
             rig.append(Ambient((red, green, blue)))
         elif emitter.get("type") == "directional":
-            # Mitsuba's direction is the way the light travels.
+            # Mitsuba's direction is the direction of travel of the light.
             towards = -np.asarray(_numbers(emitter, "vector", "direction"))
             towards /= np.linalg.norm(towards)
             fixed = emitter.get("id", "").startswith("camera_")

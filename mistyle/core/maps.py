@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 @dataclass(frozen=True)
 class Texels:
-    """One texture set rasterised: where on the surface each texel lies (paper 4.1.4).
+    """One rasterised texture set: the surface point of each texel (paper 4.1.4).
 
     position and normal are in the working space (zero where not covered); `island` numbers the UV islands from 0,
     `face` the mesh's faces; both are -1 where no face covers the texel's centre.
@@ -32,7 +32,7 @@ class Maps:
     normal     unit tangent-space normal, -1..1, +Y (OpenGL) convention; flat is (0, 0, 1)
     roughness  perceptual roughness, 0..1 (GGX alpha = roughness squared)
     metallic   0..1
-    known      whether the texel's albedo was painted by something that saw it
+    known      whether a view that sees the texel painted its albedo
     """
 
     albedo: Float[np.ndarray, "h w 3"]
@@ -44,7 +44,7 @@ class Maps:
 
 @dataclass(frozen=True)
 class OwnMaps(Maps):
-    """Maps as a file has them, each of its own size: for renderers, to which each is a texture of its own."""
+    """Maps as a file has them, each of its own size, for renderers that take each as a separate texture."""
 
     albedo: Float[np.ndarray, "h w 3"]
     normal: Float[np.ndarray, "hn wn 3"]
@@ -57,8 +57,8 @@ FINER = 4  # texels along a side of the atlas per pixel along a side of the pict
 
 
 def coarser(size: int, pixels: int) -> int:
-    """By which power of two maps of `size` texels a side can be coarser for pictures of so many pixels a side: they
-    keep FINER times as many texels."""
+    """The power of two by which maps of `size` texels a side can shrink for pictures of `pixels` a side. The result
+    keeps at least FINER times as many texels a side."""
     by = 1
     while size // (2 * by) >= FINER * pixels and size % (2 * by) == 0:
         by *= 2
@@ -79,13 +79,13 @@ def flat_maps(size: int, albedo: float = 0.5, roughness: float = 0.5, metallic: 
 
 
 def rows_of(sizes: Sequence[tuple[int, int]]) -> list[slice]:
-    """Of texture sets in one table, texel by texel, row by row and set after set, the rows of each."""
+    """Rows of each texture set in one table of texels, which lists set after set, row by row."""
     ends = accumulate((height * width for height, width in sizes), initial=0)
     return [slice(begin, end) for begin, end in pairwise(ends)]
 
 
 def place_of(row: int, sizes: Sequence[tuple[int, int]]) -> tuple[int, int, int]:
-    """Which set a row of that table is of, and the texel's row and column there."""
+    """Texture set of a row of that table, and the texel's row and column in the set."""
     for part, (rows, (_, width)) in enumerate(zip(rows_of(sizes), sizes, strict=True)):
         if row < rows.stop:
             y, x = divmod(row - rows.start, width)

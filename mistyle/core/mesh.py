@@ -1,4 +1,4 @@
-"""The mesh as every stage sees it: positions shared by faces, everything else per face corner."""
+"""The mesh of every stage: positions shared by faces, all other attributes per face corner."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.rows import corner_rows, distinct
 
-# Radii between a mesh and its origin beyond which float32 rounds visibly: by 4 mm for 10 km of terrain at 80 km.
+# Distance from the origin, in radii, beyond which float32 rounds visibly: by 4 mm for 10 km of terrain at 80 km.
 FAR = 8.0
 
 
@@ -16,7 +16,7 @@ class Mesh:
     """Triangles in the working space: Y up, right-handed, bounding sphere of radius 1 about the origin.
 
     UVs and normals belong to face corners, so a UV seam never duplicates a position and the user's vertex order
-    survives. `part` says to which texture set a face belongs; `parts` names the sets. UVs are v up and taken modulo 1
+    survives. `part` is the texture set of a face; `parts` names the sets. UVs are v up and taken modulo 1
     (textures repeat): a kept island that crosses the square's border keeps its place, so single coordinates may lie in
     [-1, 2]. Where faces share texels, the first in face order is the one painted.
     """
@@ -31,7 +31,8 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Welded:
-    """The mesh as renderers and glTF want it: one index per distinct (position, normal, uv); `vertex` points back."""
+    """The mesh for renderers and glTF: one index per distinct (position, normal, uv); `vertex` is the index in
+    `Mesh`."""
 
     positions: Float[np.ndarray, "w 3"]
     normals: Float[np.ndarray, "w 3"]
@@ -57,8 +58,8 @@ def weld(mesh: Mesh, part: int | None = None) -> Welded:
 
 
 def local_origin(positions: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " 3"]:
-    """A point of whole numbers to keep out of float32 positions: the middle of a mesh further from its own origin than
-    `FAR` radii, else the origin."""
+    """An integer offset to subtract before float32: the middle of a mesh further from its own origin than `FAR` radii,
+    else the origin."""
     low, high = positions.min(axis=0), positions.max(axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     return np.rint(middle).astype(float) if np.abs(middle).max() > FAR * radius else np.zeros(3)

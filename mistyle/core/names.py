@@ -1,4 +1,4 @@
-"""Names made safe, by one rule for files, USD, MaterialX and MTL.
+"""Safe names, by one rule for files, USD, MaterialX and MTL.
 
 A safe name is limited in bytes of UTF-8, keeps its ending, and differs from its neighbours even where a file system
 ignores case. The same names in the same order give the same result.
@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from mistyle.core.errors import UsageError
 
 FILE_NAME = 255  # bytes that ext4, APFS and NTFS allow for the name of a file
-HIDDEN = 96  # bytes that io/store/atomic.py puts around it meanwhile: .<name>.tmp-<host>-<pid>-<n>.<ending>
+HIDDEN = 96  # bytes that io/store/atomic.py adds to temporary names: .<name>.tmp-<host>-<pid>-<n>.<ending>
 WRITTEN = FILE_NAME - HIDDEN
 ENDING = 31  # room for the longest "_<map>.<tile>.<ending>": _metallicsmoothness.1001.png
 STEM = WRITTEN - ENDING
@@ -25,7 +25,7 @@ _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 def safe_name(text: str, limit: int = ASSET, filler: str = "_") -> str:
-    """A file name that no system objects to, of at most `limit` bytes; a name that is one already stays.
+    """A file name that every system accepts, of at most `limit` bytes; a safe name stays.
 
     Letters, digits and marks of every script stay (NFC), and so do '-', '_' and '.'; each run of other characters
     becomes one `filler`.
@@ -33,7 +33,7 @@ def safe_name(text: str, limit: int = ASSET, filler: str = "_") -> str:
     text = unicodedata.normalize("NFC", text)
     if is_safe(text, limit):
         return text
-    name = re.sub("\0+", filler, "".join(c if _is_kept(c) else "\0" for c in text)).strip(f"._ {filler}")
+    name = re.sub("\0+", filler, "".join(c if _is_allowed(c) else "\0" for c in text)).strip(f"._ {filler}")
     name = name or _points(text.strip("._ ")) or "_"
     name = cut(name, limit)
     return cut(f"_{name}", limit) if _RESERVED.fullmatch(name) else name
@@ -43,7 +43,7 @@ def is_safe(text: str, limit: int = ASSET) -> bool:
     """Whether `safe_name` has nothing to change."""
     return (
         bool(text)
-        and all(map(_is_kept, text))
+        and all(map(_is_allowed, text))
         and not text.startswith(".")
         and not text.endswith(".")
         and not _RESERVED.fullmatch(text)
@@ -53,20 +53,20 @@ def is_safe(text: str, limit: int = ASSET) -> bool:
 
 
 def checked(name: str) -> str:
-    """A name that the user gave, as it is (NFC). UsageError where no file can be called so, with one that can."""
+    """A name that the user gave, as it is (NFC). UsageError, with a safe name, where no file can have it."""
     name = unicodedata.normalize("NFC", name)
     if is_safe(name):
         return name
     size = len(name.encode(errors="replace"))
     why = f"{size} bytes of UTF-8" if size > ASSET else "characters that do not suit file names"
-    wanted = f"letters, digits, '-', '_' and '.', at most {ASSET} bytes"
-    raise UsageError(f"--name {name!r}: found {why}, expected {wanted}; try {safe_name(name)!r}")
+    expected = f"letters, digits, '-', '_' and '.', at most {ASSET} bytes"
+    raise UsageError(f"--name {name!r}: found {why}, expected {expected}; try {safe_name(name)!r}")
 
 
-def asset_name(said: str | None, *parts: str) -> str:
-    """The asset's name: as the user said (`checked`), else the parts, cut alike and joined by '_'."""
-    if said:
-        return checked(said)
+def asset_name(chosen: str | None, *parts: str) -> str:
+    """The asset's name: the user's (`checked`), else the parts, cut to equal length and joined by '_'."""
+    if chosen:
+        return checked(chosen)
     plain = {f"p{k}": safe_name(part, FILE_NAME) for k, part in enumerate(parts)}
     pattern = "_".join(f"{{{key}}}" for key in plain)
     return safe_name(pattern.format(**shortened(pattern, plain, list(plain), ASSET)))
@@ -75,8 +75,8 @@ def asset_name(said: str | None, *parts: str) -> str:
 def identifier(text: str, limit: int = IDENTIFIER) -> str:
     """A name as USD and MaterialX take it: ASCII letters, digits and '_', no digit first, at most `limit` bytes.
 
-    Accents are dropped; other letters become their code points, so that names of other scripts stay apart. USD before
-    24.03 and MaterialX refuse a whole file for one letter outside ASCII, hence no Unicode identifiers.
+    Accents are dropped; other letters become their code points, so that names of other scripts stay distinct. USD
+    before 24.03 and MaterialX refuse a whole file for one letter outside ASCII, hence no Unicode identifiers.
     """
     text = unicodedata.normalize("NFC", text)
     if _IDENTIFIER.fullmatch(text):
@@ -91,24 +91,24 @@ def distinct(
 ) -> list[str]:
     """The names in their order, each different from all before it; a repeated one gets _2, _3, … before its UDIM tile.
 
-    `limit` (bytes) cuts what stands before such a suffix. Names whose `key` is equal count as equal: by default those
-    that a file system may take for one another.
+    `limit` (bytes) cuts the name before such a suffix. Names with equal `key` are equal: by default those that a file
+    system may not distinguish.
     """
     key, taken, result = key or folded, set(), []
     numbers: dict[str, int] = {}
     for name in names:
         base, tile = split_tile(name)
         number = numbers.get(key(name), 1)
-        while key(made := _numbered(base, tile, number, limit, joint)) in taken:
+        while key(candidate := _numbered(base, tile, number, limit, joint)) in taken:
             number += 1
         numbers[key(name)] = number
-        taken.add(key(made))
-        result.append(made)
+        taken.add(key(candidate))
+        result.append(candidate)
     return result
 
 
 def folded(name: str) -> str:
-    """What a file system that ignores case and Unicode's forms of writing makes of a name."""
+    """The name as a file system compares it that ignores case and Unicode normalisation."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFD", name).casefold())
 
 
@@ -119,16 +119,16 @@ def split_tile(name: str) -> tuple[str, str]:
 
 
 def cut(text: str, limit: int) -> str:
-    """As many whole characters as fit into `limit` bytes of UTF-8; what was cut ends in no '.', '_' or space."""
+    """As many whole characters as fit into `limit` bytes of UTF-8; a cut text never ends in '.', '_' or a space."""
     if len(text.encode()) <= limit:
         return text
     return text.encode()[: max(limit, 0)].decode(errors="ignore").rstrip("._ ")
 
 
 def shortened(pattern: str, fields: Mapping[str, object], long: Sequence[str], limit: int) -> dict[str, object]:
-    """The fields for `pattern`.format, the `long` ones (texts) cut alike until the result has at most `limit` bytes.
+    """The fields for `pattern`.format, the `long` ones (texts) cut to equal length until the result fits `limit` bytes.
 
-    Where the rest of the pattern alone is longer they come back empty.
+    They are empty where the rest of the pattern alone is longer.
     """
     result = dict(fields)
     for room in range(limit, -1, -1):
@@ -139,7 +139,7 @@ def shortened(pattern: str, fields: Mapping[str, object], long: Sequence[str], l
 
 
 def uses(pattern: str, field: str) -> int:
-    """How often a format pattern names a field."""
+    """Number of uses of a field in a format pattern."""
     return sum(name == field for _, name, _, _ in string.Formatter().parse(pattern))
 
 
@@ -148,12 +148,12 @@ def _numbered(base: str, tile: str, number: int, limit: int | None, joint: str) 
     return (base if limit is None else cut(base, limit - len(suffix.encode()))) + suffix
 
 
-def _is_kept(c: str) -> bool:
+def _is_allowed(c: str) -> bool:
     return c in "._-" or unicodedata.category(c)[0] in "LMN"
 
 
 def _points(text: str) -> str:
-    """Code points, for names of which nothing else is left."""
+    """Code points, for names without any allowed character."""
     return "".join(f"u{ord(c):04x}" for c in text)
 
 

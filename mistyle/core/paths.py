@@ -1,4 +1,4 @@
-"""Where the files that belong to mistyle itself are."""
+"""Paths of mistyle's own files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a user may choose about the cameras of the views."""
+"""Settings of the cameras of the views."""
 
 from pathlib import Path
 from typing import Literal
@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class RigSettings(BaseModel):
-    """Where the views are taken from (paper 4.1.1)."""
+    """Camera positions of the views (paper 4.1.1)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -26,9 +26,12 @@ class RigSettings(BaseModel):
         default=0.4,
         gt=0.0,
         lt=1.0,
-        description="for kind 'nbv': the face-on weight (cosine) with which some view must see every place",
+        description="for kind 'nbv': every surface point needs a view at this cosine or more",
     )
     overlap: float = Field(
-        default=0.4, ge=0.0, lt=1.0, description="for kind 'nbv': the share that neighbouring views have in common"
+        default=0.4,
+        ge=0.0,
+        lt=1.0,
+        description="for kind 'nbv': the least overlap of neighbouring views, a share of their points",
     )
     candidates: int = Field(default=500, ge=4, le=4096, description="for kind 'nbv': cameras to choose from")

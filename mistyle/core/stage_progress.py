@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class StageProgress:
-    """Called with what is done of a part, 0..1; reports the share of the whole, which lies in low..high."""
+    """Called with the progress of a part, 0..1; reports the progress of the whole, in low..high."""
 
     report: Callable[[float], None] = lambda done: None
     low: float = 0.0

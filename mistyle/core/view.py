@@ -1,4 +1,4 @@
-"""What a camera sees, and what earlier views say about it."""
+"""Rendered views, and the prior colour from earlier views."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from mistyle.core.camera import Camera
 class View:
     """One rendered or stylized picture with its geometry.
 
-    rgb       linear Rec.709, black where nothing is seen
+    rgb       linear Rec.709, black off the mesh
     depth     metric z in the camera at the pixel centre, infinite off the mesh
     normal    unit shading normal in world space, zero off the mesh
     uv        texture coordinates of the pixel centre (v up), zero off the mesh
@@ -33,7 +33,7 @@ class View:
 
 @dataclass(frozen=True)
 class Prior:
-    """What the views done so far say about the next one: a linear colour and where it is known."""
+    """Colour of the next view from the views painted so far: linear Rec.709, and the mask of known pixels."""
 
     rgb: Float[np.ndarray, "h w 3"]
     known: Bool[np.ndarray, "h w"]

@@ -1,4 +1,4 @@
-"""Contours of masks: signed distances, rims, and how far two masks' contours are from one another."""
+"""Contours of masks: signed distances, rims, and the distance of two masks' contours."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -7,7 +7,8 @@ from mistyle.core.image import distance_to
 
 
 def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Signed distance from the mask's contour in pixels, positive inside; about a diagonal where there is none."""
+    """Signed distance from the mask's contour in pixels, positive inside; about a diagonal where the mask has no
+    contour."""
     far = float(np.hypot(*mask.shape))
     inside = np.minimum(distance_to(~mask), far) if not mask.all() else np.full(mask.shape, far)
     outside = np.minimum(distance_to(mask), far) if mask.any() else np.full(mask.shape, far)
@@ -15,7 +16,7 @@ def signed_distance(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def rim_of(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the mask that touch what is outside it; not the picture's border, which cuts the object."""
+    """Pixels of the mask next to its outside; the picture's border, which cuts the object, does not count."""
     padded = np.pad(mask, 1, constant_values=True)
     inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     rim = mask & ~inner
@@ -32,7 +33,7 @@ def contour_distance(drawn: Bool[np.ndarray, "h w"], seen: Bool[np.ndarray, "h w
 
 
 def block_means(image: Float[np.ndarray, "h w *c"], times: int) -> Float[np.ndarray, "h2 w2 *c"]:
-    """Means of blocks of `times` x `times` pixels; what is left over at the right and the bottom is dropped."""
+    """Means of blocks of `times` x `times` pixels; the remainder at the right and the bottom is dropped."""
     height, width = (n // times * times for n in image.shape[:2])
     rest = image.shape[2:]
     return image[:height, :width].reshape(height // times, times, width // times, times, *rest).mean(axis=(1, 3))

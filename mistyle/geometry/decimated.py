@@ -1,4 +1,4 @@
-"""UVs by way of a smaller mesh: decimate, then carry the copy's charts over to the full mesh."""
+"""UVs from a decimated proxy: decimate, then transfer the proxy's charts to the full mesh."""
 
 from collections.abc import Callable
 
@@ -37,10 +37,10 @@ def transfer(
     """Corner UVs and chart of every face of the full mesh.
 
     A face takes the chart of the proxy face nearest to its middle (nearest in space, with a penalty for another
-    direction). Its corners go to the closest point of that chart, through the barycentric coordinates of the proxy
-    face found there; beyond the chart's border the coordinates continue past the edge, so that faces across it keep
-    their area. One corner has one UV per chart, so charts stay in one piece. Faces may still fold over where the
-    proxy is much coarser than the mesh: the caller mends and packs again.
+    direction). Its corners map to the closest point of that chart, by the barycentric coordinates of the proxy face at
+    that point. Beyond the chart's border the coordinates extrapolate, so that faces across it keep their area. One
+    corner has one UV per chart, so charts stay connected. Faces may still fold over where the proxy is much coarser
+    than the mesh: the caller mends and packs again.
     """
     tree, sample_face = _samples(proxy_positions, proxy_faces)
     corners = proxy_positions[proxy_faces].astype(np.float64)
@@ -48,7 +48,7 @@ def transfer(
     home = _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick)
     home = _smooth(home, proxy_chart, faces)
     chart = proxy_chart[home]
-    # One entry per (vertex, chart) in use, with the home face of one of its corners as a candidate that always fits.
+    # One entry per (vertex, chart) in use; the home face of one of its corners is a candidate that always fits.
     key = faces.reshape(-1).astype(np.int64) * (int(proxy_chart.max()) + 2) + np.repeat(chart, 3) + 1
     _, first, back = np.unique(key, return_index=True, return_inverse=True)
     vertex, own = faces.reshape(-1)[first], np.repeat(home, 3)[first]
@@ -66,7 +66,7 @@ def transfer(
         face, weight = candidates[rows, best], weights[rows, best]
         beyond = np.any(border[face] & (weight <= 1e-9), axis=1)
         free = _barycentric(point, corners[face])
-        beyond &= (free > -1).all(axis=1)  # at slivers the plane's coordinates run away
+        beyond &= (free > -1).all(axis=1)  # at slivers the plane's coordinates diverge
         weight = np.where(beyond[:, None], free, weight)
         uvs[part] = np.einsum("nk,nkc->nc", weight, proxy_uvs[face])
         tick()
@@ -92,7 +92,7 @@ def _samples(positions: np.ndarray, faces: np.ndarray):
 
 
 def _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick) -> Int[np.ndarray, " f"]:
-    """The proxy face that lies nearest to each face's middle; one that looks another way counts as further off."""
+    """The proxy face that lies nearest to each face's middle; a different orientation adds distance."""
     result = np.empty(len(faces), np.int64)
     reach = np.sqrt(
         np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).mean()
@@ -111,8 +111,8 @@ def _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick) -> 
 
 
 def _smooth(home: Int[np.ndarray, " f"], chart: Int[np.ndarray, " g"], faces: Int[np.ndarray, "f 3"]) -> np.ndarray:
-    """Let faces join the chart that two of their three neighbours belong to, SMOOTHING times: borders get straighter
-    and single faces do not become charts."""
+    """Majority vote over the three neighbours' charts, SMOOTHING times: borders become straighter, and single faces
+    do not become charts."""
     from mistyle.geometry.uvs import group_rows
 
     a, b = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)
@@ -147,12 +147,12 @@ def closest(
         along = b - a
         length = (along**2).sum(axis=-1)
         t = np.clip(((point - a) * along).sum(axis=-1) / np.where(length > 0, length, 1), 0, 1)
-        here = ((a + along * t[..., None] - point) ** 2).sum(axis=-1)
-        nearer = here < gap
+        edge_gap = ((a + along * t[..., None] - point) ** 2).sum(axis=-1)
+        nearer = edge_gap < gap
         edge = np.zeros_like(weights)
         edge[..., k], edge[..., (k + 1) % 3] = 1 - t, t
         weights = np.where(nearer[..., None], edge, weights)
-        gap = np.where(nearer, here, gap)
+        gap = np.where(nearer, edge_gap, gap)
     return weights, gap
 
 

@@ -1,4 +1,4 @@
-"""A mesh laid on points of another space: COLMAP's points, or the visual hull that silhouettes carve."""
+"""Registration of a mesh to points of another space: COLMAP's points, or the visual hull of the silhouettes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,25 +14,25 @@ from mistyle.core.mesh import Mesh, face_areas, face_normals
 from mistyle.geometry.similarity import degrees_between, fit_similarity, scale_of, similarity
 
 COARSE_POINTS, COARSE_STEPS, COARSE_SURFACE = 250, 12, 5000
-FINE_POINTS, FINE_STEPS, FINE_SURFACE = 5000, 25, 40_000  # points that stand for the mesh's surface
+FINE_POINTS, FINE_STEPS, FINE_SURFACE = 5000, 25, 40_000  # points sampled on the mesh's surface
 FINALISTS = 6
-SPACING = 1e-3  # working units: residuals below it say nothing, since the surface is made of points
-STILL = 1e-5  # the step (working units, radians) at which point to plane has arrived
-CELLS = 40  # of the grid that evens the points out, along their diagonal
+SPACING = 1e-3  # working units: residuals below it carry no information, since the surface is sampled
+CONVERGED = 1e-5  # the step (working units, radians) at which point to plane has converged
+CELLS = 40  # along the diagonal of the grid that equalises the points' density
 HULL = 48  # cells along each side of the grid from which the visual hull is carved
-TURNS = 36  # random starting rotations beside the 24 that bring the principal axes together
-OTHER = 15.0  # degrees from which two alignments count as different ones
+TURNS = 36  # random starting rotations beside the 24 that align the principal axes
+DISTINCT_DEGREES = 15.0  # degrees beyond which two alignments are distinct
 
 
 @dataclass(frozen=True)
 class PointAlignment:
-    """The similarity that lays points on a mesh.
+    """The similarity that aligns points with a mesh.
 
     work_from_cams  takes the points' space to the working space
-    residual        root mean square distance of the kept points from the surface, in working units
-    kept            which points were close enough to count
-    rival           residual of the best other alignment over this one's, in the points' units (1 means that the points
-                    cannot tell them apart, infinite that nothing else was found)
+    residual        root mean square distance of the inliers from the surface, in working units
+    kept            mask of the inliers
+    rival           residual of the best other alignment over this one's, in the points' units (1: the points do not
+                    distinguish them; infinite: no other alignment)
     """
 
     work_from_cams: Float[np.ndarray, "4 4"]
@@ -49,27 +49,27 @@ def in_masks(
     slack: int = 2,
     framed: float = 0.34,
 ) -> Bool[np.ndarray, " n"]:
-    """Which points lie inside the object's mask, or `slack` pixels beside it, in at least `share` of the cameras that
-    have them in the frame.
+    """Mask of the points inside the object's mask, or within `slack` pixels of it, in at least `share` of the cameras
+    whose frame contains them.
 
-    This takes a scene's background out of a COLMAP model. A point that fewer than `framed` of the cameras have in their
-    frames is out: they look at the object.
+    This removes a scene's background from a COLMAP model. A point in the frames of less than `framed` of the cameras is
+    removed: the cameras look at the object.
     """
     inside, seen = np.zeros(len(points)), np.zeros(len(points))
     for camera, mask in zip(cameras, masks, strict=True):
         px, z = px_from_world(camera, points)
-        there = in_frame(camera, px) & (z > 0)
-        column, row = np.floor(px[there]).astype(np.int64).T
-        inside[there] += dilate(mask, slack)[row, column]
-        seen += there
+        framed_points = in_frame(camera, px) & (z > 0)
+        column, row = np.floor(px[framed_points]).astype(np.int64).T
+        inside[framed_points] += dilate(mask, slack)[row, column]
+        seen += framed_points
     return (seen > 0) & (seen >= framed * len(cameras)) & (inside >= share * seen)
 
 
 def visual_hull(
     cameras: Sequence[Camera], masks: Sequence[Bool[np.ndarray, "h w"]], cells: int = HULL
 ) -> Float[np.ndarray, "n 3"]:
-    """Points on the surface of what all masks allow, in the cameras' space: a grid about the point that the masks'
-    middles look at. ValueError where the masks have nothing in common."""
+    """Points on the surface of the visual hull, in the cameras' space. The grid is centred at the point closest to the
+    rays through the masks' middles. ValueError where the masks' cones do not intersect."""
     rays = [_middle(camera, mask) for camera, mask in zip(cameras, masks, strict=True) if mask.any()]
     # The point closest to all rays: sum of (I - d dᵀ)(x - o) = 0.
     lhs, rhs = np.zeros((3, 3)), np.zeros(3)
@@ -93,7 +93,8 @@ def visual_hull(
 
 
 def _middle(camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Origin and direction of the ray through the mask's middle, and the angle (radians) that the mask reaches."""
+    """Origin and direction of the ray through the mask's middle, and the angle (radians) from it to the mask's farthest
+    pixel."""
     rows, columns = np.nonzero(mask)
     middle = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
     direction = np.append((middle - camera.centre) / camera.focal, 1.0)
@@ -104,68 +105,68 @@ def _middle(camera: Camera, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, f
 def align_points(
     mesh: Mesh, points: Float[np.ndarray, "n 3"], rng: np.random.Generator, trim: float = 0.9
 ) -> tuple[PointAlignment, ...]:
-    """Similarities that lay `points` (of another space, some of them outliers) on the mesh's surface, the best first;
-    they differ from one another by more than 15 degrees.
+    """Similarities that align `points` (of another space, with outliers) with the mesh's surface, the best first; they
+    differ from one another by more than 15 degrees.
 
-    Trimmed ICP from many starts, then point to plane: in every step the closest `trim` of the points count, and the
-    mesh moves to the points, since points that move to a mesh may shrink to nothing. ValueError for fewer than 20
-    points. Wrong where the points show only a small part of the mesh; a symmetric mesh is laid any of its ways
-    (`rival` is then about 1). Take a scene's background out first (`in_masks`).
+    Trimmed ICP from many starts, then point to plane. Every step uses the closest `trim` of the points. The mesh moves
+    to the points, since points that move to a mesh may collapse. ValueError for fewer than 20 points. Unreliable where
+    the points cover only a small part of the mesh; a symmetric mesh takes any of its symmetric poses (`rival` is then
+    about 1). Remove a scene's background first (`in_masks`).
     """
     if len(points) < 20:
         raise ValueError(f"{len(points)} points; an alignment needs at least 20")
-    even = _evened(points)
+    even = _equalised(points)
     few = even[rng.permutation(len(even))[:COARSE_POINTS]]
     many = even[rng.permutation(len(even))[:FINE_POINTS]]
     rough, fine = _surface(mesh, COARSE_SURFACE, rng), _surface(mesh, FINE_SURFACE, rng)
-    found = []
+    coarse = []
     for matrix in _starts(fine.position, even, rng):
         for _ in range(COARSE_STEPS):
             matrix = _closest_step(matrix, few, rough, trim)
-        found.append((_error(matrix, few, rough, trim), matrix))
-    ends = []
-    for _, matrix in _different(found)[:FINALISTS]:
+        coarse.append((_error(matrix, few, rough, trim), matrix))
+    refined = []
+    for _, matrix in _distinct(coarse)[:FINALISTS]:
         for _ in range(FINE_STEPS):
             matrix, step = _plane_step(matrix, many, fine, trim)
-            if step < STILL:
+            if step < CONVERGED:
                 break
-        ends.append((_error(matrix, many, fine, trim), matrix))
-    ends = _different(ends)
+        refined.append((_error(matrix, many, fine, trim), matrix))
+    refined = _distinct(refined)
     result = []
-    for k, (error, matrix) in enumerate(ends):
+    for k, (error, matrix) in enumerate(refined):
         residual = error / scale_of(matrix)
-        kept = np.abs(_offsets(matrix, points, fine)) <= 3 * max(residual, 1e-9)
-        others = [other for j, (other, _) in enumerate(ends) if j != k]
+        inliers = np.abs(_offsets(matrix, points, fine)) <= 3 * max(residual, 1e-9)
+        others = [value for j, (value, _) in enumerate(refined) if j != k]
         floor = SPACING * scale_of(matrix)
         rival = max(min(others, default=np.inf), floor) / max(error, floor)
-        result.append(PointAlignment(np.linalg.inv(matrix), residual, kept, rival))
+        result.append(PointAlignment(np.linalg.inv(matrix), residual, inliers, rival))
     return tuple(result)
 
 
-def _different(found: list[tuple[float, np.ndarray]]) -> list[tuple[float, np.ndarray]]:
-    """The best first, without those that turn the mesh nearly as a better one does."""
+def _distinct(candidates: list[tuple[float, np.ndarray]]) -> list[tuple[float, np.ndarray]]:
+    """Candidates in order of error, without rotations close to that of a better one."""
     chosen: list[tuple[float, np.ndarray]] = []
-    for error, matrix in sorted(found, key=lambda pair: pair[0]):
-        if all(degrees_between(matrix, other) > OTHER for _, other in chosen):
+    for error, matrix in sorted(candidates, key=lambda pair: pair[0]):
+        if all(degrees_between(matrix, other) > DISTINCT_DEGREES for _, other in chosen):
             chosen.append((error, matrix))
     return chosen
 
 
-def _evened(points: np.ndarray) -> np.ndarray:
-    """The points without lonely ones, one for each cell of a grid: where they crowd they count no more than elsewhere.
+def _equalised(points: np.ndarray) -> np.ndarray:
+    """The points without outliers, one for each cell of a grid, so that dense regions weigh no more than others.
 
-    Lonely is who is three times as far from the eighth neighbour as most.
+    An outlier is more than three times the median distance from its eighth neighbour.
     """
     distance = np.asarray(KDTree(points).query(points, k=9)[0])[:, -1]
-    social = points[distance <= 3 * np.median(distance)]
-    cell = np.linalg.norm(np.quantile(social, 0.95, axis=0) - np.quantile(social, 0.05, axis=0)) / CELLS
-    _, first = np.unique(np.floor(social / max(cell, 1e-300)).astype(np.int64), axis=0, return_index=True)
-    return social[np.sort(first)] if len(first) >= 20 else points
+    dense = points[distance <= 3 * np.median(distance)]
+    cell = np.linalg.norm(np.quantile(dense, 0.95, axis=0) - np.quantile(dense, 0.05, axis=0)) / CELLS
+    _, first = np.unique(np.floor(dense / max(cell, 1e-300)).astype(np.int64), axis=0, return_index=True)
+    return dense[np.sort(first)] if len(first) >= 20 else points
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """Points spread evenly over a mesh, the normals of their faces, and a way to find the nearest of them."""
+    """Points distributed evenly over a mesh, the normals of their faces, and their k-d tree."""
 
     position: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "n 3"]
@@ -185,7 +186,7 @@ def _surface(mesh: Mesh, count: int, rng: np.random.Generator) -> _Surface:
 
 
 def _starts(surface: np.ndarray, points: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
-    """Similarities from the mesh to the points: medians meet, the middle distances too, the axes in many ways."""
+    """Similarities from the mesh to the points: medians and median distances coincide, the axes in many rotations."""
     (centre_m, axes_m, size_m), (centre_p, axes_p, size_p) = _frame(surface), _frame(points)
     turns = [axes_p @ turn @ axes_m.T for turn in Rotation.create_group("O").as_matrix()]
     turns += list(Rotation.random(TURNS, rng).as_matrix())
@@ -194,7 +195,7 @@ def _starts(surface: np.ndarray, points: np.ndarray, rng: np.random.Generator) -
 
 
 def _frame(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """A centre, right-handed principal axes (columns) and a size that a tenth of outliers hardly move."""
+    """A centre, right-handed principal axes (columns) and a size, robust to a tenth of outliers."""
     centre = np.median(points, axis=0)
     distance = np.linalg.norm(points - centre, axis=1)
     near = points[distance <= 2 * np.median(distance)]
@@ -203,40 +204,41 @@ def _frame(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def _matched(matrix: np.ndarray, points: np.ndarray, surface: _Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The points in the mesh's space, their distance from its surface there, and the nearest surface point."""
+    """The points in the mesh's space, their distance from its surface, and the nearest surface point."""
     back = np.linalg.inv(matrix)
     local = points @ back[:3, :3].T + back[:3, 3]
     distance, index = surface.tree.query(local)
     return local, np.asarray(distance), np.asarray(index)
 
 
-def _kept(distance: np.ndarray, trim: float) -> np.ndarray:
+def _inliers(distance: np.ndarray, trim: float) -> np.ndarray:
     return distance <= np.quantile(distance, trim)
 
 
 def _closest_step(matrix: np.ndarray, points: np.ndarray, surface: _Surface, trim: float) -> np.ndarray:
     _, distance, index = _matched(matrix, points, surface)
-    kept = _kept(distance, trim)
-    return fit_similarity(surface.position[index[kept]], points[kept])
+    inliers = _inliers(distance, trim)
+    return fit_similarity(surface.position[index[inliers]], points[inliers])
 
 
 def _offsets(matrix: np.ndarray, points: np.ndarray, surface: _Surface) -> np.ndarray:
     """Distance of the points from the mesh, in its units: from the nearest surface point's plane, which is finer than
-    the points' spacing, or from that point where the plane comes much closer (it goes on beyond an edge)."""
+    the points' spacing. Where the plane, extended beyond an edge, is much closer, it is the distance from that
+    point."""
     local, distance, index = _matched(matrix, points, surface)
     plane = ((local - surface.position[index]) * surface.normal[index]).sum(axis=1)
     return np.where(np.abs(plane) < distance / 2 - 0.02, distance, plane)
 
 
 def _plane_step(matrix: np.ndarray, points: np.ndarray, surface: _Surface, trim: float) -> tuple[np.ndarray, float]:
-    """One Gauss-Newton step of the mesh (turn, shift and growth in its own space) towards the planes' offsets, and its
-    greatest component."""
+    """One Gauss-Newton step of the mesh's similarity (rotation, translation and scale in its own space) on the planes'
+    offsets, and its greatest component."""
     local, distance, index = _matched(matrix, points, surface)
-    kept = _kept(distance, trim)
-    m, n = surface.position[index[kept]], surface.normal[index[kept]]
-    offset = ((local[kept] - m) * n).sum(axis=1)
+    inliers = _inliers(distance, trim)
+    m, n = surface.position[index[inliers]], surface.normal[index[inliers]]
+    offset = ((local[inliers] - m) * n).sum(axis=1)
     rows = np.concatenate([np.cross(m, n), n, (n * m).sum(axis=1, keepdims=True)], axis=1)
-    # Directions that the surface leaves open (a sphere's turns) must not run away.
+    # Directions that the surface does not constrain (a sphere's rotations) must not diverge.
     step = np.linalg.solve(rows.T @ rows + 1e-6 * len(rows) * np.eye(7), rows.T @ offset)
     step /= max(1.0, float(np.abs(step).max()) / 0.2)
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
@@ -244,7 +246,7 @@ def _plane_step(matrix: np.ndarray, points: np.ndarray, surface: _Surface, trim:
 
 
 def _error(matrix: np.ndarray, points: np.ndarray, surface: _Surface, trim: float) -> float:
-    """Root mean square offset of the closest `trim` of the points, in the points' units: in the mesh's, a mesh that
-    has grown out of all proportion would fit best."""
+    """Root mean square offset of the closest `trim` of the points, in the points' units: in the mesh's units
+    an extremely large mesh would fit best."""
     offset = np.abs(_offsets(matrix, points, surface))
-    return scale_of(matrix) * float(np.sqrt(np.mean(offset[_kept(offset, trim)] ** 2)))
+    return scale_of(matrix) * float(np.sqrt(np.mean(offset[_inliers(offset, trim)] ** 2)))

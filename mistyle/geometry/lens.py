@@ -1,4 +1,4 @@
-"""Lenses of photographs, and the pinhole camera that sees the same without distortion and with square pixels.
+"""Lens distortion of photographs, and the equivalent pinhole camera with square pixels.
 
 Brown's model as OpenCV, COLMAP and transforms.json write it. With x, y = tangents in the camera (x right, y down) and
 r² = x² + y²,
@@ -7,7 +7,7 @@ r² = x² + y²,
     y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2 y²) + 2 p2 x y
     pixel = (fx x' + cx, fy y' + cy)
 
-in the pixel convention of core/camera.py. The model holds as far out as its radial part rises; beyond, it folds back.
+in the pixel convention of core/camera.py. The model holds as far as its radial part rises; beyond, it folds back.
 """
 
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from jaxtyping import Bool, Float
 from mistyle.core.camera import pixel_centres
 from mistyle.core.image import bilinear
 
-# Focal lengths that differ by less than this share are taken as one: 0.02 pixels at the border of 4000.
+# Focal lengths that differ by less than this share are equal: 0.02 pixels at the border of 4000.
 SQUARE = 1e-5
-ROWS = 256  # of a picture at a time, so that the coordinates of 12 megapixels need not fit in memory together
+ROWS = 256  # of a picture at a time, to bound the memory for the coordinates of 12 megapixels
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How a photograph's pixels follow from tangents: `focal` (x, y) and `centre` in pixels, `size` (height, width),
+    """The map from tangents to a photograph's pixels: `focal` (x, y) and `centre` in pixels, `size` (height, width),
     `radial` k1 k2 k3 and `tangential` p1 p2 without unit."""
 
     focal: tuple[float, float]
@@ -36,19 +36,19 @@ class Lens:
 
 
 def is_distorted(lens: Lens) -> bool:
-    """Whether straight lines come out bent."""
+    """Whether straight lines appear curved."""
     return any(lens.radial) or any(lens.tangential)
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Whether the photograph is what core/camera.py's Camera sees: no distortion, square pixels."""
+    """Whether core/camera.py's Camera describes the photograph: no distortion, square pixels."""
     return not is_distorted(lens) and abs(lens.focal[0] - lens.focal[1]) <= SQUARE * lens.focal[0]
 
 
 def pinhole(lens: Lens) -> tuple[float, tuple[float, float], tuple[int, int]]:
     """Focal length, centre and size of the pinhole camera that a photograph is resampled to.
 
-    The longer focal length counts for both axes, so that no direction loses resolution; the field of view is that of
+    The longer focal length applies to both axes, so that no direction loses resolution; the field of view is that of
     the photograph without its distortion.
     """
     if is_pinhole(lens):
@@ -60,23 +60,24 @@ def pinhole(lens: Lens) -> tuple[float, tuple[float, float], tuple[int, int]]:
 
 
 def distort(lens: Lens, tangents: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    """Where the lens sends tangents (x, y) of the camera; NaN beyond the radius where the radial part stops rising."""
+    """Distorted tangents of tangents (x, y) of the camera; NaN beyond the radius where the radial part stops rising."""
     x, y = np.moveaxis(np.asarray(tangents, float), -1, 0)
     (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    sent = np.stack(
+    distorted = np.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
             y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
         ],
         axis=-1,
     )
-    return np.where((r2 < _reach(lens))[..., None], sent, np.nan)
+    return np.where((r2 < _reach(lens))[..., None], distorted, np.nan)
 
 
 def px_in_photograph(lens: Lens, px: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    """Pixel coordinates in the photograph of pixel coordinates of its `pinhole`; NaN where the lens sees nothing."""
+    """Pixel coordinates in the photograph of pixel coordinates of its `pinhole`; NaN outside the model's valid
+    radius."""
     focal, centre, _ = pinhole(lens)
     return distort(lens, (px - np.asarray(centre)) / focal) * np.asarray(lens.focal) + np.asarray(lens.centre)
 
@@ -84,10 +85,10 @@ def px_in_photograph(lens: Lens, px: Float[np.ndarray, "*n 2"]) -> Float[np.ndar
 def resample(
     lens: Lens, picture: Float[np.ndarray, "h w c"], counts: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "H W c"], Bool[np.ndarray, "H W"]]:
-    """The photograph as its `pinhole` sees it (linear values, bilinear), and which of its pixels count.
+    """The photograph resampled to its `pinhole` (linear values, bilinear), and the mask of valid pixels.
 
-    A pixel counts when every pixel that it is mixed from does; what lies beyond the photograph is 0 and does not.
-    A photograph that needs no resampling comes back as it is.
+    A pixel is valid when every pixel in its footprint is; pixels beyond the photograph are 0 and invalid. A photograph
+    that needs no resampling is returned unchanged.
     """
     if is_pinhole(lens):
         return picture, counts

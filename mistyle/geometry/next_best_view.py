@@ -1,8 +1,8 @@
-"""Next-best-view rigs (paper 6.2.1, which leaves them open): the fewest cameras that see a surface well.
+"""Next-best-view rigs (an open point of paper 6.2.1): the fewest cameras that see a surface well.
 
-The surface is a set of points of equal area, `weight` (c s) says how much each of c candidate cameras faces each of
-them, max(0, n . (c - P) / |c - P|) as in `stages.backproject`, and 0 where the point is hidden or out of the frame.
-A view sees a point well from the weight `least` on. This module knows nothing of meshes or rays.
+The surface is a set of points of equal area. `weight` (c s) is the cosine at which each of c candidate cameras
+faces each of them, max(0, n . (c - P) / |c - P|) as in `atlas.bake.backproject`, and 0 where the point is hidden or out
+of the frame. A view sees a point well at a weight of `least` or more. This module has no meshes and no rays.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from mistyle.core.camera import Camera, orbit
 from mistyle.core.rig_settings import RigSettings
 
 GOLDEN_ANGLE = 180 * (3 - 5**0.5)
-STARTS = 8  # first views that are tried, the most seeing ones
-PASSES = 3  # rounds of exchange; later ones hardly ever find anything
+STARTS = 8  # first views that are tried: those with the largest covered area
+PASSES = 3  # rounds of exchange; later ones hardly ever improve
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Which candidates make the rig.
+    """The chosen candidates of a rig.
 
     order      candidates in visiting order: each after the one it overlaps most
     overlap    of each view with that earlier one (NaN for the first), as in `overlaps`
-    reachable  which points any candidate sees well
-    covered    which points the chosen ones see well
+    reachable  points that any candidate sees well
+    covered    points that the chosen ones see well
     """
 
     order: Int[np.ndarray, " k"]
@@ -49,9 +49,9 @@ def candidate_cameras(settings: RigSettings) -> list[Camera]:
 
 
 def overlaps(weight: Float[np.ndarray, "c s"], least: float) -> Float[np.ndarray, "c c"]:
-    """Share of what one view sees well that the other sees well too; of the two ways to take it, the smaller.
+    """Share of the points seen well by one view that the other also sees well; the smaller of the two directions.
 
-    Points count by their weight, which is their share of the picture as long as all are about equally far away.
+    Points are weighted by `weight`, which is their share of the picture where all are about equally far away.
     """
     good = weight >= least
     seen = np.where(good, weight, 0).astype(np.float32)
@@ -61,14 +61,14 @@ def overlaps(weight: Float[np.ndarray, "c s"], least: float) -> Float[np.ndarray
 
 
 def choose(weight: Float[np.ndarray, "c s"], least: float = 0.4, least_overlap: float = 0.4, most: int = 32) -> Choice:
-    """The smallest set of candidates found by which every reachable point is seen well, `most` at the utmost.
+    """A small set of at most `most` candidates that together see every reachable point well.
 
-    Neighbouring views overlap: in the graph that joins views whose overlap is `least_overlap` or more, the rig is
-    connected, so each view but the first can be warped into from an earlier one. Greedy from STARTS first views (the
-    candidate with the largest gain per view that has to be added to reach it through overlapping ones), then exchange
-    of single views, then views are left out as long as an exchange makes up for them. Greedy alone stays within 1 + ln
-    s of the smallest set (Chvatal 1979) when the overlap does not bind. Where `most` binds, the points covered are what
-    is maximised.
+    Neighbouring views overlap: the rig is connected in the graph of views with an overlap of `least_overlap` or more.
+    So an earlier view can be warped into each view but the first. The search is greedy from STARTS first views: it adds
+    the candidate with the largest gain per view, counting the overlapping views on the path to it. Then it exchanges
+    single views, then it drops views as long as an exchange compensates. Greedy alone stays within 1 + ln s of the
+    smallest set (Chvatal 1979) when the overlap does not bind. Where `most` binds, the search maximises the covered
+    points.
     """
     reachable = (weight >= least).max(axis=0)
     share = overlaps(weight, least)
@@ -102,9 +102,9 @@ def greedy(
 ) -> list[int]:
     """`first`, then candidates in the order of their gain; points that no linked candidate reaches stay uncovered."""
     chosen = [first]
-    left = np.flatnonzero(good[:, first] == 0)
-    while len(left) and len(chosen) < most:
-        gain = value[left] @ good[left]
+    uncovered = np.flatnonzero(good[:, first] == 0)
+    while len(uncovered) and len(chosen) < most:
+        gain = value[uncovered] @ good[uncovered]
         steps, before = distances(linked, chosen, gain)
         worth = np.where((steps > 0) & (steps <= most - len(chosen)), gain / np.maximum(steps, 1), 0)
         best = int(worth.argmax())
@@ -114,23 +114,23 @@ def greedy(
         while steps[path[0]] > 1:
             path.insert(0, int(before[path[0]]))
         chosen += path
-        left = left[good[np.ix_(left, np.array(path))].max(axis=1) == 0]
+        uncovered = uncovered[good[np.ix_(uncovered, np.array(path))].max(axis=1) == 0]
     return chosen
 
 
 def distances(
     linked: Bool[np.ndarray, "c c"], chosen: Sequence[int], gain: Float[np.ndarray, " c"]
 ) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
-    """How many views away each candidate is from the chosen ones (-1: not to be reached), and the candidate before it
-    on the way, of equally short ways the one of largest gain."""
+    """Path length from the chosen views to each candidate (-1: unreachable), and the candidate before it on the path;
+    of equally short paths the one of largest gain."""
     steps = np.full(len(linked), -1)
     before = np.full(len(linked), -1)
     steps[list(chosen)] = 0
     rim = np.array(chosen)
     while len(rim):
-        met = linked[:, rim] & (steps < 0)[:, None]
-        fresh = np.flatnonzero(met.any(axis=1))
-        before[fresh] = rim[np.where(met[fresh], gain[rim], -1).argmax(axis=1)]
+        reached = linked[:, rim] & (steps < 0)[:, None]
+        fresh = np.flatnonzero(reached.any(axis=1))
+        before[fresh] = rim[np.where(reached[fresh], gain[rim], -1).argmax(axis=1)]
         steps[fresh] = steps[rim[0]] + 1
         rim = fresh
     return steps, before
@@ -149,7 +149,7 @@ def connected(linked: Bool[np.ndarray, "c c"], chosen: Sequence[int]) -> bool:
 def exchange(
     good: Float[np.ndarray, "s c"], value: Float[np.ndarray, " s"], linked: Bool[np.ndarray, "c c"], start: list[int]
 ) -> list[int]:
-    """Single views are replaced while the points covered grow and the rig stays connected."""
+    """Replace single views while coverage grows and the rig stays connected."""
     chosen = list(start)
     count = good[:, chosen].sum(axis=1)
     for _ in range(PASSES):
@@ -158,8 +158,8 @@ def exchange(
             if count.all():
                 return chosen
             rest = count - good[:, old]
-            left = np.flatnonzero(rest == 0)
-            gain = value[left] @ good[left]
+            uncovered = np.flatnonzero(rest == 0)
+            gain = value[uncovered] @ good[uncovered]
             for new in np.argsort(-gain, kind="stable"):
                 if gain[new] <= gain[old]:
                     break
@@ -174,12 +174,12 @@ def exchange(
 def shrink(
     good: Float[np.ndarray, "s c"], value: Float[np.ndarray, " s"], linked: Bool[np.ndarray, "c c"], start: list[int]
 ) -> list[int]:
-    """Views are left out, the least missed first, as long as exchanges cover all that `start` covers."""
+    """Drop views, the smallest loss first, as long as exchanges restore the coverage of `start`."""
     chosen, goal = list(start), covered_value(good, value, start)
     while len(chosen) > 1:
         alone = good[:, chosen].sum(axis=1) == 1
-        missed = value[alone] @ good[np.ix_(alone, np.array(chosen))]
-        trials = (chosen[:k] + chosen[k + 1 :] for k in np.argsort(missed, kind="stable"))
+        loss = value[alone] @ good[np.ix_(alone, np.array(chosen))]
+        trials = (chosen[:k] + chosen[k + 1 :] for k in np.argsort(loss, kind="stable"))
         trial = next((t for t in trials if connected(linked, t)), None)
         if trial is None:
             break
@@ -193,12 +193,12 @@ def shrink(
 def visit(
     area: Float[np.ndarray, " c"], share: Float[np.ndarray, "c c"], chosen: Sequence[int]
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Visiting order, first the view that sees most, and each one's overlap with the earlier one it overlaps most."""
-    left = sorted(chosen)
-    order, overlap = [max(left, key=lambda c: area[c])], [float("nan")]
-    left.remove(order[0])
-    while left:
-        best = share[np.ix_(left, order)].max(axis=1)
-        order.append(left.pop(int(best.argmax())))
+    """Visiting order from the view with the largest area, and each view's largest overlap with an earlier one."""
+    remaining = sorted(chosen)
+    order, overlap = [max(remaining, key=lambda c: area[c])], [float("nan")]
+    remaining.remove(order[0])
+    while remaining:
+        best = share[np.ix_(remaining, order)].max(axis=1)
+        order.append(remaining.pop(int(best.argmax())))
         overlap.append(float(best.max()))
     return np.array(order), np.array(overlap, np.float32)

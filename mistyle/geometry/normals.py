@@ -1,10 +1,10 @@
-"""Shading normals for meshes that come without, and which vertices are the same point."""
+"""Shading normals for meshes without any, and the identity of vertices at equal positions."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 CREASE_DEGREES = 50.0
-# A corner looks at every face around its vertex; beyond this many faces (poles, fans) it looks at their sum instead.
+# A corner compares every face around its vertex; beyond this many faces (poles, fans) it compares their sum.
 MAX_VALENCE = 128
 CHUNK = 2_000_000
 
@@ -12,7 +12,7 @@ CHUNK = 2_000_000
 def same_points(positions: Float[np.ndarray, "v 3"]) -> Int[np.ndarray, " v"]:
     """A number per vertex, equal for vertices at bit-equal positions (0 and -0 are equal), in order of appearance.
 
-    Files split vertices at UV seams; connectivity and smoothing must not stop there. Nothing is merged in the mesh.
+    Files split vertices at UV seams; connectivity and smoothing must cross the seams. The mesh itself stays unmerged.
     """
     x, y, z = (positions + 0.0).T
     order = np.lexsort((z, y, x))
@@ -42,7 +42,7 @@ def crease_normals(
 ) -> Float[np.ndarray, "f 3 3"]:
     """Unit normal per face corner: the area-weighted mean over the faces around the point whose own normals lie
     within `degrees` of the corner's face. Corners of degenerate faces take the plain mean around their point, and
-    (0, 1, 0) where there is none. `points` comes from `same_points`. At points with more than MAX_VALENCE faces the
+    (0, 1, 0) where it vanishes. `points` comes from `same_points`. At points with more than MAX_VALENCE faces the
     mean of all of them decides whether the corner is smooth.
     """
     vectors = area_vectors(positions, faces)
@@ -61,8 +61,8 @@ def crease_normals(
     pairwise = ~degenerate & (valence[corner_point] <= MAX_VALENCE)
     _smooth_pairs(result, np.flatnonzero(pairwise), corner_point, valence, vectors, units, limit)
     normals = _unit(result)
-    lost = ~normals.any(axis=1)
-    normals[lost] = np.where(own[lost].any(axis=1, keepdims=True), own[lost], np.array([0.0, 1.0, 0.0]))
+    zero = ~normals.any(axis=1)
+    normals[zero] = np.where(own[zero].any(axis=1, keepdims=True), own[zero], np.array([0.0, 1.0, 0.0]))
     return normals.reshape(-1, 3, 3).astype(np.float32)
 
 
@@ -85,11 +85,11 @@ def _smooth_pairs(
         done = ends[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(ends, done + CHUNK)))
         chosen, n = corners[start:stop], sizes[start:stop]
-        here = np.repeat(np.arange(len(chosen)), n)
-        step = np.arange(len(here)) - np.repeat(np.cumsum(n) - n, n)
-        other = by_point[first[corner_point[chosen]][here] + step] // 3
-        near = (units[chosen // 3][here] * units[other]).sum(axis=1) >= limit
-        result[chosen] = _sum_by(here[near], vectors[other[near]], len(chosen))
+        row = np.repeat(np.arange(len(chosen)), n)
+        step = np.arange(len(row)) - np.repeat(np.cumsum(n) - n, n)
+        face = by_point[first[corner_point[chosen]][row] + step] // 3
+        near = (units[chosen // 3][row] * units[face]).sum(axis=1) >= limit
+        result[chosen] = _sum_by(row[near], vectors[face[near]], len(chosen))
         start = stop
 
 
@@ -103,7 +103,7 @@ def _unit(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def usable_normals(normals: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, "f 3"]:
-    """Which corner normals are finite and long enough to be a direction."""
+    """Mask of corner normals that are finite and long enough for a direction."""
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(normals.astype(np.float64), axis=2)
     return np.isfinite(length) & (length > 1e-6)

@@ -1,4 +1,4 @@
-"""Which texel centres a UV triangle covers: watertight scan conversion in numpy."""
+"""Watertight scan conversion of UV triangles to texel centres, in numpy."""
 
 from collections.abc import Iterator
 
@@ -13,20 +13,20 @@ def fragments(
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
     """Face and texel (row * size + column) of every texel centre inside a triangle, in face order.
 
-    `uv` is in texels: x to the right, y up or down as the caller likes (rows follow y). Centres lie at +0.5. A centre
+    `uv` is in texels: x to the right, y up or down as the caller chooses (rows follow y). Centres lie at +0.5. A centre
     on an edge belongs to one of the two triangles that share the edge, never to both or neither. With `wrap`,
-    coordinates are taken modulo `size`; otherwise what lies outside is left out.
+    coordinates are taken modulo `size`; otherwise fragments outside are dropped.
     """
-    found = list(fragment_pieces(uv, size, wrap=wrap))
-    if not found:
+    pieces = list(fragment_pieces(uv, size, wrap=wrap))
+    if not pieces:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return np.concatenate([face for face, _ in found]), np.concatenate([texel for _, texel in found])
+    return np.concatenate([face for face, _ in pieces]), np.concatenate([texel for _, texel in pieces])
 
 
 def fragment_pieces(
     uv: Float[np.ndarray, "f 3 2"], size: int, *, wrap: bool = True
 ) -> Iterator[tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]]:
-    """`fragments` piece after piece, so that those of a large atlas need not be held together."""
+    """`fragments` in pieces, to bound the memory for a large atlas."""
     for face, column, row in _pieces(uv):
         if wrap:
             column, row = column % size, row % size
@@ -61,7 +61,7 @@ def _pieces(uv: Float[np.ndarray, "f 3 2"]) -> Iterator[tuple[np.ndarray, np.nda
 def _spans(corners: Float[np.ndarray, "s 3 2"], y: Float[np.ndarray, " s"]) -> tuple[np.ndarray, np.ndarray]:
     """First column and number of columns whose centres lie inside each triangle at height y.
 
-    Each edge is walked from its lower end, whichever triangle asks, so that both sides compute the same crossing.
+    Each edge is evaluated from its lower end, so that both of its triangles compute the same crossing.
     """
     left, right = np.full(len(y), np.inf), np.full(len(y), -np.inf)
     for k in range(3):

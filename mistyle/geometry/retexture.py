@@ -1,4 +1,4 @@
-"""Carry a texture from one set of UVs to another."""
+"""Resampling of a texture from one set of UVs to another."""
 
 from typing import Literal
 
@@ -9,7 +9,7 @@ from mistyle.geometry.normals import area_vectors
 from mistyle.geometry.raster import fragments
 from mistyle.geometry.uvs import signed_areas
 
-# What a texture shows outside the unit square: itself again, itself mirrored at every whole number, or its last texel.
+# Wrap mode outside the unit square: repeated, mirrored at every integer, or clamped to the last texel.
 Wrap = Literal["repeat", "mirror", "clamp"]
 Wraps = tuple[Wrap, Wrap]  # along u and along v
 REPEAT: Wraps = ("repeat", "repeat")
@@ -22,10 +22,10 @@ def carry(
     size: int,
     wrap: Wraps = REPEAT,
 ) -> tuple[np.ndarray, Int[np.ndarray, "h w"]]:
-    """A texture of size² for `uvs` that shows on every face what `values` shows at `lookup`, and each texel's face.
+    """A texture of size² for `uvs` that equals `values` at `lookup` on every face, and each texel's face.
 
-    Both UVs are v up, row 0 is v = 1; the new texture repeats, the old one does as `wrap` says. Sampled bilinearly at
-    texel centres; where faces share a texel the first in face order counts; texels without a face (face -1) take their
+    Both UVs are v up, row 0 is v = 1; the new texture repeats, the old one wraps by `wrap`. Sampled bilinearly at
+    texel centres; the first of several faces at a texel counts; texels without a face (face -1) take their
     nearest covered neighbour.
     """
     channels = values if values.ndim == 3 else values[..., None]
@@ -38,8 +38,8 @@ def carry(
 def carry_corners(
     values: Float[np.ndarray, "f 3 c"], uvs: Float[np.ndarray, "f 3 2"], size: int
 ) -> Float[np.ndarray, "h w c"]:
-    """A texture of size² for `uvs` that shows what `values` gives the corners, interpolated over each face as `carry`
-    looks textures up."""
+    """A texture of size² for `uvs` from the corner values `values`, interpolated over each face at the texels of
+    `carry`."""
     pieces, face, weights = covered_texels(uvs, size)
     return _filled(
         pieces, face, np.einsum("nk,nkc->nc", weights.astype(np.float32), values[face].astype(np.float32)), size
@@ -54,7 +54,7 @@ def covered_texels(
     spot = uvs.astype(np.float64) * [size, -size] + [0, size]  # y grows with the row
     face, texel = fragments(spot, size)
     owner = np.full(size * size, -1, np.int64)
-    # Written backwards, so that the first face stays.
+    # Written in reverse order, so that the first face stays.
     owner[texel[::-1]] = np.arange(len(texel))[::-1]
     pieces = np.flatnonzero(owner >= 0)
     face = face[owner[pieces]]
@@ -64,7 +64,8 @@ def covered_texels(
 def _filled(
     pieces: Int[np.ndarray, " n"], face: Int[np.ndarray, " n"], values: Float[np.ndarray, "n c"], size: int
 ) -> tuple[Float[np.ndarray, "h w c"], Int[np.ndarray, "h w"]]:
-    """The texture in which the texels `pieces` have these values and faces, the others those of their neighbours."""
+    """The texture with these values and faces at the texels `pieces`; all others take their nearest neighbour's
+    value."""
     result = np.zeros((size * size, values.shape[1]), np.float32)
     result[pieces] = values
     faces = np.full(size * size, -1, np.int64)
@@ -75,9 +76,9 @@ def _filled(
 def texel_weights(
     spot: Float[np.ndarray, "n 3 2"], texel: Int[np.ndarray, " n"], size: int
 ) -> Float[np.ndarray, "n 3"]:
-    """Barycentric coordinates of a texel's centre in the triangle that covers it, whatever tile that lies in."""
+    """Barycentric coordinates of a texel's centre in the triangle that covers it, in any tile."""
     centre = np.stack([texel % size, texel // size], axis=1) + 0.5
-    centre += np.ceil((spot.min(axis=1) - centre) / size) * size  # the repetition inside the triangle's box
+    centre += np.ceil((spot.min(axis=1) - centre) / size) * size  # the copy inside the triangle's box
     a, b, c = spot[:, 0], spot[:, 1], spot[:, 2]
     area = _cross(b - a, c - a)
     area = np.where(area == 0, 1, area)
@@ -90,19 +91,19 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def wrapped(index: Int[np.ndarray, " n"], count: int, wrap: Wrap) -> Int[np.ndarray, " n"]:
-    """The texel among `count` that stands at `index`, which may be any whole number."""
+    """The texel of `count` at `index`, which may be any integer."""
     if wrap == "clamp":
         return np.clip(index, 0, count - 1)
     if wrap == "mirror":
-        there = index % (2 * count)
-        return np.minimum(there, 2 * count - 1 - there)
+        folded = index % (2 * count)
+        return np.minimum(folded, 2 * count - 1 - folded)
     return index % count
 
 
 def fetch(
     values: Float[np.ndarray, "h w c"], uv: Float[np.ndarray, "n 2"], wrap: Wraps = REPEAT
 ) -> Float[np.ndarray, "n c"]:
-    """Bilinear lookup, v up; `wrap` says what lies outside the unit square."""
+    """Bilinear lookup, v up; `wrap` sets the values outside the unit square."""
     h, w = values.shape[:2]
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
@@ -131,27 +132,27 @@ def turn_normals(
     old: Float[np.ndarray, "f 3 2"],
     new: Float[np.ndarray, "f 3 2"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """Tangent-space normals that stand in the frame of the old UVs, in the frame of the new ones.
+    """Tangent-space normals converted from the frame of the old UVs to that of the new ones.
 
-    Frames are taken per face (exact where UVs are conformal, which MikkTSpace's averages also assume); texels without
-    a face are left as they are, and so are faces without area in either set.
+    Frames are taken per face (exact where UVs are conformal, which MikkTSpace's averages also assume); texels
+    without a face, and faces without area in either set, stay unchanged.
     """
     tangent_old, bitangent_old = _frames(positions, faces, old)
     tangent_new, bitangent_new = _frames(positions, faces, new)
     rows = [[(n * o).sum(axis=1) for o in (tangent_old, bitangent_old)] for n in (tangent_new, bitangent_new)]
-    turn = np.moveaxis(np.array(rows), 2, 0)
-    lost = ~np.isfinite(turn).all(axis=(1, 2)) | (np.abs(np.linalg.det(np.nan_to_num(turn))) < 0.5)
-    turn[lost] = np.eye(2)
+    rotation = np.moveaxis(np.array(rows), 2, 0)
+    singular = ~np.isfinite(rotation).all(axis=(1, 2)) | (np.abs(np.linalg.det(np.nan_to_num(rotation))) < 0.5)
+    rotation[singular] = np.eye(2)
     result = normal.copy()
     covered = face >= 0
-    result[covered, :2] = np.einsum("nij,nj->ni", turn[face[covered]], normal[covered][:, :2])
+    result[covered, :2] = np.einsum("nij,nj->ni", rotation[face[covered]], normal[covered][:, :2])
     return (result / np.linalg.norm(result, axis=2, keepdims=True)).astype(np.float32)
 
 
 def _frames(
     positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unit tangent (along u) of every face and the bitangent, which the sign of the UV area turns over."""
+    """Unit tangent (along u) of every face, and the bitangent; the sign of the UV area flips it."""
     corners, uv = positions[faces].astype(np.float64), uvs.astype(np.float64)
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     v1, v2 = uv[:, 1, 1] - uv[:, 0, 1], uv[:, 2, 1] - uv[:, 0, 1]

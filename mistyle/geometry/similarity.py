@@ -1,8 +1,8 @@
-"""Similarities between a mesh's space and that of the cameras, and references moved by them.
+"""Similarity transforms between a mesh's space and the cameras', and references transformed by them.
 
-A similarity is a 4 x 4 matrix [s R, t; 0, 1] with a rotation R and a scale s > 0. `work_from_cams` takes the space in
-which references came (COLMAP's, a NeRF's) to the working space, in which the mesh has a bounding sphere of radius 1.
-Where references came in the mesh's own units, that is the mesh's `Source.work_from_user`.
+A similarity is a 4 x 4 matrix [s R, t; 0, 1] with a rotation R and a scale s > 0. `work_from_cams` takes the
+references' space (COLMAP's, a NeRF's) to the working space, in which the mesh has a bounding sphere of radius 1. For
+references in the mesh's own units it is the mesh's `Source.work_from_user`.
 """
 
 from dataclasses import replace
@@ -41,19 +41,19 @@ def scale_of(matrix: Float[np.ndarray, "4 4"]) -> float:
     scale = np.cbrt(determinant)
     upright = determinant > 0 and np.allclose(matrix[3], [0, 0, 0, 1])
     if not upright or np.abs(linear @ linear.T / scale**2 - np.eye(3)).max() > 1e-6:
-        raise ValueError(f"no similarity: {np.asarray(matrix).tolist()}")
+        raise ValueError(f"not a similarity: {np.asarray(matrix).tolist()}")
     return float(scale)
 
 
 def moved_camera(camera: Camera, matrix: Float[np.ndarray, "4 4"]) -> Camera:
-    """The camera that sees the moved world as `camera` saw it before."""
+    """The camera whose picture of the moved world equals `camera`'s of the original."""
     pose = matrix @ camera.world_from_cam
     pose[:3, :3] /= scale_of(matrix)
     return replace(camera, world_from_cam=pose)
 
 
 def moved_lights(rig: Lights, matrix: Float[np.ndarray, "4 4"]) -> Lights:
-    """The lights of the moved world: what was lit before is lit the same.
+    """The lights of the moved world: the illumination of every surface stays the same.
 
     A point light's distances grow by the scale, so its intensity grows by the scale's square. An environment's map is
     resampled unless the motion only turns it about Y.
@@ -62,13 +62,13 @@ def moved_lights(rig: Lights, matrix: Float[np.ndarray, "4 4"]) -> Lights:
 
 
 def moved(captures: Captures, work_from_cams: Float[np.ndarray, "4 4"]) -> Captures:
-    """References with cameras and lights in another space; the pictures stay what they are."""
-    known: dict[int, Lights] = {}
+    """References with cameras and lights in another space; the pictures do not change."""
+    rig_cache: dict[int, Lights] = {}
     rigs = []
     for rig in captures.lights:
-        if id(rig) not in known:
-            known[id(rig)] = moved_lights(rig, work_from_cams)
-        rigs.append(known[id(rig)])
+        if id(rig) not in rig_cache:
+            rig_cache[id(rig)] = moved_lights(rig, work_from_cams)
+        rigs.append(rig_cache[id(rig)])
     cameras = tuple(moved_camera(camera, work_from_cams) for camera in captures.cameras)
     return Captures(cameras, tuple(rigs), captures.load)
 
@@ -90,7 +90,7 @@ def _moved(light: Light, matrix: Float[np.ndarray, "4 4"]) -> Light:
 
 
 def turned(light: Environment, rotation: Float[np.ndarray, "3 3"]) -> Environment:
-    """The environment with everything in it rotated; exact about Y, else resampled (bilinear) at the map's own size."""
+    """The rotated environment; exact about Y, else resampled (bilinear) at the map's own size."""
     if abs(rotation[1, 1] - 1) < 1e-12:
         return replace(light, turn=light.turn + float(np.degrees(np.arctan2(rotation[0, 2], rotation[2, 2]))))
     directions = environment_directions(*light.radiance.shape[:2])

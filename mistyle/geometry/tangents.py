@@ -1,10 +1,10 @@
-"""Tangents as MikkTSpace makes them, the frame in which glTF's and our normal maps are written.
+"""MikkTSpace tangents: the frame of glTF's and our normal maps.
 
 The algorithm is Morten Mikkelsen's ("Simulation of Wrinkled Surfaces Revisited", 2008, chapter on tangent space, and
 its public reference implementation): corners with equal position, normal and uv are one vertex; around it, faces
 joined by shared edges and of one uv handedness form a group; a group's tangent is the angle-weighted sum of the
-faces' tangents, each projected into the plane of the vertex normal. Steps that decide something (uv area, handedness,
-degeneracy) are computed in float32 like the reference, so that borderline faces fall on the same side.
+faces' tangents, each projected into the plane of the vertex normal. Decisions (uv area, handedness, degeneracy) are
+computed in float32 like the reference, so that borderline faces fall on the same side.
 """
 
 from dataclasses import dataclass
@@ -25,12 +25,12 @@ def mikktspace(
 ) -> Float[np.ndarray, "f 3 4"]:
     """Per-corner tangent (unit) and sign; the bitangent is sign * cross(normal, tangent) and follows growing v.
 
-    With v up, as in memory everywhere here, the result is what glTF wants in TANGENT for its own (v down) texture
-    coordinates. Normals are unit vectors.
+    With v up, as in all our records, the result is glTF's TANGENT for its own (v down) texture coordinates. Normals are
+    unit vectors.
 
-    Where the reference has no answer (no uv area around the vertex, or tangents that cancel) it returns (1, 0, 0)
-    or zero; here such a corner gets some unit vector perpendicular to its normal, and sign -1 where no uv area
-    decides. The reference's angular threshold is at its default of 180 degrees, and groups are not split where two
+    Where the reference has no result (no uv area around the vertex, or tangents that cancel) it returns (1, 0, 0)
+    or zero; here such a corner gets a unit vector perpendicular to its normal, and sign -1 without uv
+    area. The reference's angular threshold is at its default of 180 degrees, and groups are not split where two
     tangents are exactly opposite.
     """
     result = _perpendicular(normals.astype(np.float32))[faces]
@@ -42,27 +42,27 @@ def mikktspace(
     position, normal, uv = (x[chosen].astype(np.float32) for x in (positions, normals, uvs))
     point = _point_ids(position)[corners]
     good = (point[:, 0] != point[:, 1]) & (point[:, 1] != point[:, 2]) & (point[:, 2] != point[:, 0])
-    kept = np.flatnonzero(good)
-    if len(kept) == 0:
+    valid_faces = np.flatnonzero(good)
+    if len(valid_faces) == 0:
         return result
-    corners_kept = corners[kept]
-    frames = _face_frames(position[corners_kept], uv[corners_kept])
-    group, positive = _groups(corners_kept, frames)
-    tangent, valid = _group_tangents(corners_kept, position, normal, frames, group)
+    valid_corners = corners[valid_faces]
+    frames = _face_frames(position[valid_corners], uv[valid_corners])
+    group, positive = _groups(valid_corners, frames)
+    tangent, valid = _group_tangents(valid_corners, position, normal, frames, group)
     inside = group >= 0
     use = np.zeros_like(inside)
     use[inside] = valid[group[inside]]
-    found = result[kept]
-    found[use, :3] = tangent[group[use]]
-    found[inside, 3] = np.where(positive[inside], 1, -1)
-    result[kept] = found
+    tangents = result[valid_faces]
+    tangents[use, :3] = tangent[group[use]]
+    tangents[inside, 3] = np.where(positive[inside], 1, -1)
+    result[valid_faces] = tangents
     _copy_to_degenerate(result, corners, good)
     return result
 
 
 @dataclass(frozen=True)
 class _Frames:
-    """Per face: unit tangent along growing u, whether its uvs keep the orientation, whether it says nothing at all."""
+    """Per face: unit tangent along growing u, whether its uvs keep the orientation, whether it has no tangent."""
 
     tangent: Float[np.ndarray, "f 3"]
     positive: Bool[np.ndarray, " f"]
@@ -103,10 +103,10 @@ def _face_frames(p: Float[np.ndarray, "f 3 3"], t: Float[np.ndarray, "f 3 2"]) -
     has_area = np.abs(area) > _TINY
     safe = np.where(has_area, np.abs(area), np.float32(1))
     with np.errstate(over="ignore"):
-        speaks = has_area & (length_u / safe > _TINY) & (length_v / safe > _TINY)
+        has_tangent = has_area & (length_u / safe > _TINY) & (length_v / safe > _TINY)
     sign = np.where(positive, np.float32(1), np.float32(-1))
     tangent = along_u * (sign / np.where(length_u > _TINY, length_u, np.float32(1)))[:, None]
-    return _Frames(np.where(has_area[:, None], tangent, np.float32(0)), positive, ~speaks)
+    return _Frames(np.where(has_area[:, None], tangent, np.float32(0)), positive, ~has_tangent)
 
 
 def _groups(corners: Int[np.ndarray, "f 3"], frames: _Frames) -> tuple[Int[np.ndarray, "f 3"], Bool[np.ndarray, "f 3"]]:
@@ -116,8 +116,8 @@ def _groups(corners: Int[np.ndarray, "f 3"], frames: _Frames) -> tuple[Int[np.nd
 
     links = _corner_links(corners)
     face = links // 3
-    speaks = ~frames.silent[face].any(axis=1)
-    joined = links[speaks & (frames.positive[face[:, 0]] == frames.positive[face[:, 1]])]
+    has_tangent = ~frames.silent[face].any(axis=1)
+    joined = links[has_tangent & (frames.positive[face[:, 0]] == frames.positive[face[:, 1]])]
     count = corners.size
     graph = coo_array((np.ones(len(joined), bool), (joined[:, 0], joined[:, 1])), shape=(count, count))
     label = connected_components(graph, directed=False)[1].astype(np.int64)
@@ -133,7 +133,7 @@ def _groups(corners: Int[np.ndarray, "f 3"], frames: _Frames) -> tuple[Int[np.nd
 def _corner_links(corners: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "k 2"]:
     """Pairs of corners of one vertex in two faces that share an edge at it, in opposite directions.
 
-    Of more than two faces at an edge, the reference pairs them in order of their numbers; so does this.
+    More than two faces at an edge are paired in order of their numbers, as in the reference.
     """
     start = np.arange(corners.size)
     end = (start // 3) * 3 + (start + 1) % 3
@@ -151,18 +151,18 @@ def _corner_links(corners: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "k 2"]:
         rest = order[begin : begin + number].tolist()
         while rest:
             edge = rest.pop(0)
-            other = next((e for e in rest if a[edge] == b[e]), None)
-            if other is not None:
-                rest.remove(other)
-                pairs.append(np.array([[edge, other]]))
+            match = next((e for e in rest if a[edge] == b[e]), None)
+            if match is not None:
+                rest.remove(match)
+                pairs.append(np.array([[edge, match]]))
     x, y = np.concatenate(pairs).T
     return np.concatenate([np.stack([x, end[y]], axis=1), np.stack([end[x], y], axis=1)])
 
 
 def _join_silent(vertex, links, frames: _Frames, label: np.ndarray, positive: np.ndarray) -> None:
-    """Redo, one group after the other, the grouping at vertices of faces without a tangent of their own.
+    """Redo the grouping, group by group, at vertices of faces without a tangent of their own.
 
-    Such a face joins any group and takes the handedness of the first that reaches it, so the order matters; it is
+    Such a face joins any group and takes the handedness of the first that reaches it, so the order matters. It is
     the reference's (faces and corners ascending). Changes `label` and `positive` of these corners in place.
     """
     silent = frames.silent
@@ -192,14 +192,14 @@ def _join_silent(vertex, links, frames: _Frames, label: np.ndarray, positive: np
 
 
 def _group_tangents(corners, position, normal, frames: _Frames, group) -> tuple[np.ndarray, np.ndarray]:
-    """Angle-weighted, projected sum of the faces' tangents per group, and whether anything is left of it."""
+    """Angle-weighted, projected sum of the faces' tangents per group, and whether it is valid (does not cancel)."""
     used = (group >= 0) & ~frames.silent[:, None]
     face, corner = np.nonzero(used)
-    here = corners[face, corner]
-    n = normal[here]
-    to_previous = _flattened(position[corners[face, (corner + 2) % 3]] - position[here], n)
-    to_next = _flattened(position[corners[face, (corner + 1) % 3]] - position[here], n)
-    # The 1e-9 counts only where all angles round to 0 (needles); the reference returns a zero vector there.
+    vertex = corners[face, corner]
+    n = normal[vertex]
+    to_previous = _flattened(position[corners[face, (corner + 2) % 3]] - position[vertex], n)
+    to_next = _flattened(position[corners[face, (corner + 1) % 3]] - position[vertex], n)
+    # The 1e-9 matters only where all angles round to 0 (needles); the reference returns a zero vector there.
     angle = np.arccos(np.clip(_dot(to_previous, to_next), -1, 1).astype(np.float64)) + 1e-9
     tangent = _flattened(frames.tangent[face], n)
     number = int(group.max(initial=-1)) + 1
@@ -212,7 +212,7 @@ def _group_tangents(corners, position, normal, frames: _Frames, group) -> tuple[
 
 
 def _copy_to_degenerate(result: np.ndarray, corners: np.ndarray, good: np.ndarray) -> None:
-    """A face with two equal positions takes the tangents of the first other face at each of its vertices."""
+    """A face with two equal positions takes, at each vertex, the tangent of the first other face."""
     if good.all():
         return
     where = np.flatnonzero(good)
@@ -231,7 +231,7 @@ def _perpendicular(n: Float[np.ndarray, "w 3"]) -> Float[np.ndarray, "w 3"]:
 
 
 def _flattened(v: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Projected into the plane of n and made a unit vector where anything is left."""
+    """Projected into the plane of n and normalised where the length is not zero."""
     v = v - _dot(n, v)[:, None] * n
     length = _length(v)
     return np.where((length > _TINY)[:, None], v / np.where(length > _TINY, length, np.float32(1))[:, None], v)

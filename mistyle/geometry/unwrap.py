@@ -1,4 +1,4 @@
-"""New UVs for meshes without usable ones: xatlas in a child process, every chart counter-clockwise."""
+"""UV unwrapping with xatlas in a child process; every chart is counter-clockwise."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ from mistyle.core.paths import PACKAGE
 from mistyle.geometry.normals import area_vectors, same_points
 
 # Above this a decimated proxy is unwrapped and its UVs are transferred. xatlas's time grows with the faces' power 1.65
-# (bunny, 69,451 faces: 24 s) and its charts follow every bump; through the proxy the bunny takes 5 s, falls into 109
+# (bunny, 69,451 faces: 24 s) and its charts follow every bump. Through the proxy the bunny takes 5 s, has 109
 # charts instead of 653, and stretches less (mean ratio of the singular values 1.02 instead of 1.05).
 PROXY_ABOVE = 20_000
 PROXY_FACES = 15_000
@@ -25,10 +25,10 @@ TRANSFER_SECONDS = 30e-6
 
 
 def estimated_seconds(faces: int) -> float:
-    """About how long `unwrap` takes for a mesh of so many faces, on one core of a 2-core machine."""
+    """Estimated seconds of `unwrap` for a mesh of `faces` faces, on one core of a 2-core machine."""
     direct = min(faces, PROXY_FACES) if faces > PROXY_ABOVE else faces
-    carried = faces * TRANSFER_SECONDS if faces > PROXY_ABOVE else 0.0
-    return 1.5 + XATLAS_SECONDS * (direct / XATLAS_FACES) ** XATLAS_POWER + carried
+    transfer = faces * TRANSFER_SECONDS if faces > PROXY_ABOVE else 0.0
+    return 1.5 + XATLAS_SECONDS * (direct / XATLAS_FACES) ** XATLAS_POWER + transfer
 
 
 def unwrap(
@@ -41,13 +41,13 @@ def unwrap(
     """Corner UVs (v up) for each mesh, each in a unit square of its own.
 
     Charts lie at least `padding` texels apart in an atlas of size² (default: size / 256, at least 2; less where many
-    small charts would leave it more room than themselves) and are never mirrored: every face with an area in space has
-    a positive one in UV space. Faces without area get a point. Vertices at equal positions count as one, whatever the
-    file's indices say; faces that repeat others (double-sided models) get texels of their own. Texel density is the
-    same all over a mesh up to xatlas's stretch (5 % on the bunny). Above PROXY_ABOVE faces a decimated copy is
-    unwrapped and each face takes over the chart of the copy's nearest face. Equal inputs give equal bytes.
+    small charts need more room for padding than for themselves). Charts are never mirrored: every face with an area in
+    space has a positive one in UV space. Faces without area get a point. Vertices at equal positions count as one,
+    whatever the file's indices; faces that repeat others (double-sided models) get texels of their own. Texel density
+    is uniform over a mesh up to xatlas's stretch (5 % on the bunny). Above PROXY_ABOVE faces a decimated copy is
+    unwrapped, and each face takes the chart of the copy's nearest face. Equal inputs give equal bytes.
 
-    `progress` hears a share estimated from the time gone by: xatlas reports nothing. An interrupt ends the child.
+    `progress` receives a share estimated from the elapsed time: xatlas reports none. An interrupt ends the child.
     """
     from mistyle.geometry import decimated as proxy
 
@@ -74,7 +74,7 @@ def unwrap(
 
 
 def _clean(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points instead of vertices, repeated faces moved away from what they repeat, mean face area 1.
+    """Merge vertices at equal positions, move repeated faces away from their originals, scale to mean face area 1.
 
     xatlas ends charts at edges with more than two faces, so a double-sided model would fall into single triangles; and
     it drops faces of less than 1e-7 units².
@@ -84,22 +84,22 @@ def _clean(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     lookup = np.zeros(len(positions), np.int64)
     lookup[used] = points
     count = int(points.max(initial=-1)) + 1
-    where = np.zeros((count, 3))
-    where[points] = positions[used]
+    coords = np.zeros((count, 3))
+    coords[points] = positions[used]
     index = lookup[faces]
-    where -= where.mean(axis=0) if count else 0
-    areas = np.linalg.norm(area_vectors(where, index), axis=1)
-    where /= np.sqrt(areas.sum() / max(np.count_nonzero(areas), 1)) if areas.any() else 1
+    coords -= coords.mean(axis=0) if count else 0
+    areas = np.linalg.norm(area_vectors(coords, index), axis=1)
+    coords /= np.sqrt(areas.sum() / max(np.count_nonzero(areas), 1)) if areas.any() else 1
     layer = _repeats(index)
     if layer.any():
-        step = 4 * np.ptp(where[:, 0]) + 1
-        copies = [where + np.array([k * step, 0, 0]) for k in range(int(layer.max()) + 1)]
-        where, index = np.concatenate(copies), index + (layer * count)[:, None]
-    return where.astype(np.float32), index.astype(np.int32)
+        step = 4 * np.ptp(coords[:, 0]) + 1
+        copies = [coords + np.array([k * step, 0, 0]) for k in range(int(layer.max()) + 1)]
+        coords, index = np.concatenate(copies), index + (layer * count)[:, None]
+    return coords.astype(np.float32), index.astype(np.int32)
 
 
 def _repeats(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
-    """How many earlier faces have the same three points."""
+    """Number of earlier faces with the same three points."""
     from mistyle.geometry.uvs import group_rows
 
     corners = np.sort(faces, axis=1)
@@ -115,7 +115,7 @@ def _repeats(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
 def _child(
     meshes: Sequence[dict[str, np.ndarray]], size: int, padding: int, tick: Callable[[], None]
 ) -> list[dict[str, np.ndarray]]:
-    """Run the worker on the meshes; raise what it said where it failed."""
+    """Run the worker on the meshes; InputRefused with its last message where it fails."""
     with tempfile.TemporaryDirectory(prefix="mistyle-unwrap-") as folder:
         source, target = Path(folder, "in.npz"), Path(folder, "out.npz")
         arrays = {f"{name}_{i}": array for i, mesh in enumerate(meshes) for name, array in mesh.items()}
@@ -129,7 +129,7 @@ def _child(
         try:
             while True:
                 try:
-                    said = child.communicate(timeout=0.2)[1]
+                    stderr = child.communicate(timeout=0.2)[1]
                     break
                 except subprocess.TimeoutExpired:
                     tick()
@@ -139,7 +139,7 @@ def _child(
                 child.wait()
         if child.returncode != 0 or not target.is_file():
             faces = sum(len(mesh["faces"]) for mesh in meshes)
-            last = said.decode("utf-8", "replace").strip().splitlines()[-1:] or ["no message"]
+            last = stderr.decode("utf-8", "replace").strip().splitlines()[-1:] or ["no message"]
             raise InputRefused(
                 f"unwrapping {faces} faces with xatlas ended with code {child.returncode} ({last[0]}); expected UVs. "
                 "Give the mesh UVs in a modelling program (Blender: UV > Smart UV Project) and run again"

@@ -1,4 +1,4 @@
-"""What a set of UVs is good for: islands, whole-face shifts into the unit square, UDIM tiles, overlaps."""
+"""Analysis of authored UVs: islands, whole-face shifts into the unit square, UDIM tiles, overlaps."""
 
 from dataclasses import dataclass
 
@@ -13,15 +13,15 @@ BORDER = 1e-5
 NO_AREA = 1e-13
 RASTER = 512
 MAX_DEGENERATE = 0.01  # share of the surface without UV area
-MAX_OVERLAP = 0.01  # share of covered texels that faces claim without sharing them
+MAX_OVERLAP = 0.01  # share of covered texels with unintended overlaps
 MIN_COVERAGE = 0.002  # share of the square in use; colour-swatch UVs stay below it
-COINCIDE = 0.97  # two islands that cover each other this far lie on top of each other
+COINCIDE = 0.97  # islands that cover each other this far coincide
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether one texture set's UVs can be painted. `reason` says why not; the shares are of the covered texels
-    (overlap, shared) and of the UV area (mirrored, coverage of the square)."""
+    """Whether one texture set's UVs can be painted. `reason` is the reason why not; the shares are of the covered
+    texels (overlap, shared) and of the UV area (mirrored, coverage of the square)."""
 
     usable: bool
     reason: str
@@ -33,8 +33,8 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Layout:
-    """UVs moved for work: whole faces by integers. `tile` is the UDIM tile of each face (1001 + u + 10 v), 1001 for all
-    where the set is not tiled; `verdicts` has one entry per tile in ascending order."""
+    """UVs in working layout: whole faces moved by integers. `tile` is the UDIM tile of each face (1001 + u + 10 v),
+    1001 for all where the set is not tiled; `verdicts` has one entry per tile in ascending order."""
 
     uvs: Float[np.ndarray, "f 3 2"]
     tile: Int[np.ndarray, " f"]
@@ -100,9 +100,9 @@ def island_boxes(uvs: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"])
 def shift(uvs: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"]) -> Float[np.ndarray, "f 3 2"]:
     """Move whole faces by integers towards the unit square.
 
-    An island that fits one tile goes into the square as a whole; one that fits the square's size but crosses a tile
-    border goes where its middle is inside, so coordinates stay in [-0.5, 1.5]; of a larger one every face goes by its
-    own middle (the texture repeats there anyway). UVs that need no move come back bit-equal.
+    An island that fits one tile moves into the square as a whole. One that fits the square's size but crosses a tile
+    border moves until its middle is inside, so coordinates stay in [-0.5, 1.5]. In a larger one every face moves by its
+    own middle (the texture repeats anyway). UVs that need no move stay bit-equal.
     """
     lo, hi = island_boxes(uvs, island)
     corner = np.floor(lo + BORDER)
@@ -121,7 +121,7 @@ def _moved(uvs: Float[np.ndarray, "f 3 2"], base: Float[np.ndarray, "f 2"]) -> F
 
 
 def tiles(uvs: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"]) -> Int[np.ndarray, "f 2"] | None:
-    """The UDIM tile (u, v) of every face, or None where the UVs are no UDIM layout: every island must lie inside one
+    """The UDIM tile (u, v) of every face, or None where the UVs are not a UDIM layout: every island must lie inside one
     tile with u in 0..9 and v in 0..9."""
     lo, hi = island_boxes(uvs, island)
     corner = np.floor(lo + BORDER)
@@ -133,11 +133,11 @@ def tiles(uvs: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"]) -> Int
 def arrange(
     points: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"], area: Float[np.ndarray, " f"], udim: bool | None
 ) -> Layout:
-    """Lay authored UVs out for work and judge them.
+    """The working layout of authored UVs, and their verdicts.
 
     `area` is each face's area in space. `udim`: True when the material's textures are named as tiles, False when one
-    texture repeats over every tile, None when nothing tells. Then islands in several tiles count as a UDIM layout
-    unless they come to lie exactly on top of each other in the square (shells parked one tile away to share texels).
+    texture repeats over every tile, None when unknown. Then islands in several tiles count as a UDIM layout,
+    unless they coincide exactly in the square (shells moved one tile away to share texels).
     """
     single = np.full(len(uvs), 1001)
     if not np.isfinite(uvs).all():
@@ -160,23 +160,23 @@ def arrange(
 
 
 def judge(points: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"], area: Float[np.ndarray, " f"]) -> Verdict:
-    """Whether one set of UVs (taken modulo 1) can be painted: enough area, and no texel that two faces claim unless
-    they mean to share it. Sampled at RASTER² texel centres."""
+    """Whether one set of UVs (taken modulo 1) can be painted: enough area, and no texel that two faces cover
+    unintentionally. Sampled at RASTER² texel centres."""
     flat = signed_areas(uvs)
     total = area.sum()
-    lost = area[np.abs(flat) <= NO_AREA].sum() / total if total > 0 else 1.0
-    if lost > MAX_DEGENERATE:
-        return Verdict(False, f"{lost:.0%} of the surface has no area in UV space")
+    degenerate = area[np.abs(flat) <= NO_AREA].sum() / total if total > 0 else 1.0
+    if degenerate > MAX_DEGENERATE:
+        return Verdict(False, f"{degenerate:.0%} of the surface has no area in UV space")
     if np.abs(flat).sum() > 64 or (np.ptp(uvs, axis=1) > 4).any():
         return Verdict(False, "the texture repeats many times over the surface")
     mirrored = float(np.abs(flat[flat < 0]).sum() / np.abs(flat).sum())
-    kept = _first_of_twins(points, uvs)
-    face, texel = fragments(uvs[kept].astype(np.float64) * RASTER, RASTER)
+    distinct_faces = _first_of_twins(points, uvs)
+    face, texel = fragments(uvs[distinct_faces].astype(np.float64) * RASTER, RASTER)
     # Counted, not np.unique, whose hashing of consecutive numbers takes a second.
     covered = np.count_nonzero(np.bincount(texel, minlength=RASTER**2))
     coverage = covered / RASTER**2
-    overlap, shared = _overlaps(points[kept], uvs[kept], face, texel)
-    shared = max(shared, 1 - len(kept) / len(uvs))
+    overlap, shared = _overlaps(points[distinct_faces], uvs[distinct_faces], face, texel)
+    shared = max(shared, 1 - len(distinct_faces) / len(uvs))
     numbers = dict(overlap=overlap, shared=shared, mirrored=mirrored, coverage=coverage)
     if overlap > MAX_OVERLAP:
         return Verdict(False, f"{overlap:.0%} of its texels are claimed by faces that do not share them", **numbers)
@@ -198,7 +198,7 @@ def _overlaps(
     face: Int[np.ndarray, " n"],
     texel: Int[np.ndarray, " n"],
 ) -> tuple[float, float]:
-    """Shares of the covered texels that are claimed twice without being shared, and that are shared on purpose."""
+    """Shares of the covered texels with unintended and with intended overlaps."""
     counts = np.bincount(texel, minlength=RASTER * RASTER)
     covered = np.count_nonzero(counts)
     several = counts[texel] > 1
@@ -209,8 +209,8 @@ def _overlaps(
     f, t = face[several][order], texel[several][order]
     same = t[1:] == t[:-1]
     first, second, where = f[:-1][same], f[1:][same], t[1:][same]
-    means_to = _stacked(points, uvs)
-    fine = means_to[first] & means_to[second] & (first != second)
+    intended = _stacked(points, uvs)
+    fine = intended[first] & intended[second] & (first != second)
     a, b = island[first], island[second]
     fine |= (a != b) & _coincident(a, b, island[face], texel)
     bad = len(np.unique(where[~fine]))
@@ -230,7 +230,7 @@ def _coincident(
 
 def _stacked(points: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"]) -> Bool[np.ndarray, " f"]:
     """Faces whose corners all lie on corners of other points in UV space, or on the line where an island folds over:
-    the mark of shells laid on top of each other on purpose."""
+    the mark of intentionally stacked shells."""
     flat = signed_areas(uvs)
     edges = np.linalg.norm(uvs - np.roll(uvs, 1, axis=1), axis=2)
     cells = int(np.ceil(max(2048.0, 10 / max(float(np.median(edges)), 1e-5))))

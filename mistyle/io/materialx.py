@@ -1,7 +1,7 @@
-"""MaterialX 1.39: one OpenPBR surface per material, its images beside it. Written as XML, without the library.
+"""MaterialX 1.39 export: one OpenPBR surface per material, its images beside it. Written as XML, without the library.
 
 Nodes and inputs are those of the specification (`ND_open_pbr_surface_surfaceshader`, `ND_normalmap_float`); colours
-are given as "srgb_texture" in 8-bit files and by their linear space in EXR, data as none.
+are declared as "srgb_texture" in 8-bit files and by their linear space in EXR, data as none.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from mistyle.io.store.atomic import atomic_write
 
 @dataclass(frozen=True)
 class TexturedMaterial:
-    """A material and its images: file names as the document names them. The albedo is sRGB, or light in `space` (None:
+    """A material and its images: file names as the document names them. The albedo is sRGB, or linear in `space` (None:
     linear Rec.709). `name` is an identifier (core/names.py); `title` is the user's name for it, or ""."""
 
     name: str
@@ -34,7 +34,7 @@ def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
     """Write the document; texture coordinates have v up, as MaterialX has them. Normal maps are tangent space, +Y."""
     root = Element("materialx", version="1.39", colorspace="lin_rec709")
     names = [look.name for look in looks]
-    # Siblings of one document: a material may itself be called SR_….
+    # Names are unique in the document: a material's own name may be SR_….
     every = distinct([*names, *(f"NG_{n}" for n in names), *(f"SR_{n}" for n in names)])
     rows = zip(looks, every[len(names) : 2 * len(names)], every[2 * len(names) :], strict=True)
     for look, graph_name, surface_name in rows:

@@ -1,12 +1,11 @@
-"""The only reader of pictures and tables that a user or a stranger hands in; `read_mesh.py` is that of meshes.
+"""Reader of all pictures and tables that come from outside; `read_mesh.py` reads meshes.
 
-What cannot be used is refused (core/errors.py InputRefused) with the file, what was found, what was expected and the
-fix. Nothing is fetched from a network, and nothing is repaired in silence: what was changed on the way in is in
-`Picture.notes`.
+Unusable files are refused (core/errors.py InputRefused) with the file, the content found, the content expected and the
+fix. No network is used, and no repair is silent: `Picture.notes` lists the conversions.
 
 Files are opened and decoded in the reader process (io/sandbox/reader_process.py), which has limits on memory and time
-and cannot write; here only the numbers that it found are put together. A Mitsuba scene of the user's (`--scene`) is not
-read here: it can name any file and plugin and is trusted like code.
+and cannot write; this module only assembles its numbers. A user's Mitsuba scene (`--scene`) is not read here: it can
+name any file and plugin and is trusted like code.
 """
 
 from pathlib import Path
@@ -43,8 +42,8 @@ __all__ = [
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
     """The channels of an OpenEXR file by full name ("R", "normal.X"), float32, display window, row 0 at the top.
 
-    The header is checked before anything is decoded: windows, number of channels, texels. Of a file with several parts
-    all are read, their names before the channels'. Deep files and subsampled channels are refused.
+    The header is checked before decoding: windows, number of channels, texels. All parts of a file are read, with their
+    names before the channels'. Deep files and subsampled channels are refused.
     """
     return {name: np.asarray(plane, np.float32) for name, plane in ask("exr", Path(path)).items()}
 

@@ -1,10 +1,10 @@
-"""The only reader of mesh files that a user or a stranger hands in, and of what they name; bounded.
+"""Reader of all mesh files that come from outside, and of the files that they name; bounded.
 
-What cannot be used is refused (core/errors.py InputRefused) with the file, what was found, what was expected and the
-fix. Nothing outside a mesh's own folder is opened but pictures in the folder `textures` beside it, and nothing is
-repaired in silence: what was changed on the way in is in `Source.notes`.
+Unusable files are refused (core/errors.py InputRefused) with the file, the content found, the content expected and the
+fix. Only files in a mesh's own folder are opened, and pictures in the folder `textures` beside it. No repair is silent:
+`Source.notes` lists the changes.
 
-Files are opened and decoded in the reader process (io/sandbox/reader_process.py), as those of `read.py` are.
+Files are opened and decoded in the reader process (io/sandbox/reader_process.py), as in `read.py`.
 """
 
 from collections.abc import Callable
@@ -32,8 +32,8 @@ MESHES = {
     ".usdc": "mistyle.io.usd.read:read_usd",
     ".usdz": "mistyle.io.usd.read:read_usd",
 }
-"""Who reads a mesh file, by its ending: "module:function" of (path: Path, max_faces: int) -> what
-io/meshes/parsed_mesh.py has.
+"""Readers of mesh files by their ending: "module:function" of (path: Path, max_faces: int) -> a record of
+io/meshes/parsed_mesh.py.
 
 The function runs in the reader process, which imports its module then: it refuses with InputRefused, opens other files
 only through io/sandbox/bounds.py (`read_bytes`, `beside`), checks indices and positions (io/meshes/polygons.py), and
@@ -53,19 +53,19 @@ def read_mesh(
 ) -> Asset:
     """A mesh file as an asset: vertex and face order as in the file, bounding sphere of radius 1, Y up.
 
-    uv        "auto" keeps authored UVs where they can be painted and unwraps the materials that have none or unusable
-              ones; "keep" refuses those; "new" unwraps every material
+    uv        "auto" keeps authored UVs where they can be painted and unwraps the materials with none or unusable ones;
+              "keep" refuses those; "new" unwraps every material
     up        "z" turns a mesh modelled with Z up
     max_faces refuses larger meshes (and more than three times as many vertices)
-    size      the atlas size that a new unwrapping's padding is meant for
-    lit       writing a glTF result takes KHR_materials_unlit from its painted materials
-    progress  hears a share of 1; reading takes the first tenth, unwrapping most of the rest
+    size      the atlas size for the padding of a new unwrapping
+    lit       a glTF result drops KHR_materials_unlit from its painted materials
+    progress  receives the share done, 0..1; reading takes the first tenth, unwrapping most of the rest
 
     OBJ, PLY, STL, OFF, GLB, glTF and USD, each without merging or reordering vertices (STL, which repeats them, is
-    joined and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees
+    welded, with a note). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees
     (glTF: flat, as it demands). One part per material and UDIM tile. Texture transforms, wrap modes and vertex colours
     are resolved: the maps repeat at the mesh's UVs, the albedo has the colours in it. Morph targets
-    stand at the file's own weights, a skinned mesh in the pose of its joints. Not read: animations, Draco and meshopt
+    have the file's own weights, a skinned mesh the pose of its joints. Not read: animations, Draco and meshopt
     compression without a plain copy (refused).
     """
     from mistyle.io.meshes.prepare import prepare
@@ -76,7 +76,7 @@ def read_mesh(
 
 
 def _raw(path: Path, max_faces: int) -> Raw:
-    """What the file says, checked."""
+    """The parsed file, checked."""
     kind = path.suffix.lower()
     if kind not in MESHES:
         found = f"a file ending in '{kind}'" if kind else "a file without an ending"
@@ -91,7 +91,7 @@ def _raw(path: Path, max_faces: int) -> Raw:
 def read_extent(
     path: Path, *, uv: Literal["keep", "new", "auto"] = "auto", max_faces: int = 5_000_000, size: int = 2048
 ) -> Extent:
-    """How large the asset of `read_mesh` will be: its faces, texture sets and own maps; nothing is unwrapped."""
+    """The size of `read_mesh`'s asset: its faces, texture sets and own maps; nothing is unwrapped."""
     from mistyle.io.meshes.prepare import extent
 
     path = Path(path)
@@ -99,7 +99,7 @@ def read_extent(
 
 
 def read_usd_files(path: Path) -> list[Path]:
-    """The files that a USD file stands on: its layers, packages and textures, as far as they are in its folder."""
+    """The files that a USD file depends on: its layers, packages and textures in its own folder."""
     return [Path(file) for file in ask("usd_files", Path(path))]
 
 
@@ -110,7 +110,8 @@ def load_gltf(path: Path) -> tuple[dict[str, Any], list[bytes]]:
 
 
 def read_gltf_alpha(path: Path, image: int) -> Float[np.ndarray, "h w"] | None:
-    """The alpha (0..1, row 0 at the top) of a glTF file's image of that number; None where it has none or is opaque."""
+    """The alpha (0..1, row 0 at the top) of image number `image` of a glTF file; None where it has none or is
+    opaque."""
     return ask("gltf_alpha", Path(path), image)
 
 

@@ -1,1 +1,1 @@
-"""The process around the work: memory, threads, signals, child processes, weight files."""
+"""Process control: memory, threads, signals, child processes, weight files."""

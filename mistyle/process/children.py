@@ -1,4 +1,4 @@
-"""Processes that must not outlive the one that started them: called at their beginning, by themselves."""
+"""Child processes end with their parent; each child calls this at its start."""
 
 import contextlib
 import os
@@ -6,14 +6,14 @@ import sys
 import threading
 import time
 
-PARENT = "MISTYLE_PARENT"  # the number of the process that waits for this one
+PARENT = "MISTYLE_PARENT"  # PID of the process that waits for this one
 
 
 def end_with_parent(pid: int | None = None) -> None:
-    """End at once when the parent process ends, however it ends; a parent that is gone already counts.
+    """End at once when the parent process ends, however it ends, or when it has ended already.
 
-    `pid` is the parent's number as the parent knows it, which closes the gap between the start and this call. Linux
-    does it with a signal of the kernel (SIGKILL); elsewhere a thread looks twice a second.
+    `pid` is the parent's PID. It closes the gap between the start and this call. On Linux the kernel sends SIGKILL;
+    elsewhere a thread polls twice a second.
     """
     pid = os.getppid() if pid is None else pid
     if sys.platform == "linux":
@@ -28,7 +28,7 @@ def end_with_parent(pid: int | None = None) -> None:
 
 
 def end_with_asker() -> None:
-    """`end_with_parent` where the one that started this process asks for it by $MISTYLE_PARENT."""
+    """`end_with_parent` where the parent's environment sets $MISTYLE_PARENT."""
     with contextlib.suppress(ValueError):
         end_with_parent(int(os.environ.pop(PARENT, "none")))
 

@@ -1,4 +1,4 @@
-"""How many processor cores this process may use, and how many it does."""
+"""Processor cores: how many this process may use, and how many it uses."""
 
 import os
 import sys
@@ -9,23 +9,23 @@ PIECE = 1 << 23
 
 
 def cores() -> int:
-    """Those that the system lets it run on, which in a container or on a farm are fewer than the machine has."""
+    """Cores that the system grants this process: in a container or on a farm, fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def use_threads(count: int) -> None:
-    """Have torch, OpenCV and the BLAS of NumPy and SciPy work on `count` threads from here on, in this process.
+    """Set the thread count of torch, OpenCV and the BLAS of NumPy and SciPy in this process to `count`.
 
-    A product of matrices has other last digits at another count, and a BLAS left alone takes all cores, however many
-    shards share them. Dr.Jit has its own count: `render/device.use`.
+    The last digits of a matrix product depend on the count. By default a BLAS takes all cores, however many shards
+    share them. Dr.Jit has its own count: `render/mitsuba/device.use`.
     """
-    # torch waits for its threads by spinning, for milliseconds after each operation, on cores that Dr.Jit's threads and
-    # other jobs need: most of a fit's processor time. Its OpenMP reads this when it is loaded; a user's choice stays.
+    # torch spins for milliseconds after each operation, on cores that Dr.Jit's threads and other jobs need: most of a
+    # fit's processor time. OpenMP reads this variable when it is loaded; a user's value stays.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # So is its number of threads; loading torch for that alone takes seconds that a job without a fit does not have.
+    # OpenMP also reads its thread count at load time. Importing torch only to set it would take seconds.
     os.environ["OMP_NUM_THREADS"] = str(count)
     import cv2
-    import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, which could not be told later)
+    import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, whose count cannot be set later)
     from threadpoolctl import threadpool_limits
 
     if torch := sys.modules.get("torch"):
@@ -35,10 +35,9 @@ def use_threads(count: int) -> None:
 
 
 def in_pieces(place: memoryview, fill: Callable[[int, memoryview], None], threads: int) -> None:
-    """`fill(at, piece)` for all of `place`, PIECE bytes at a time, on so many threads. Raises what `fill` raises.
+    """Call `fill(at, piece)` for all of `place`, PIECE bytes at a time, on `threads` threads. Its errors propagate.
 
-    Most of the time that a large copy takes goes into pages that the system hands out anew, which it does for every
-    thread by itself.
+    A large copy spends most of its time on page faults, which the system serves per thread.
     """
     starts = range(0, len(place), PIECE)
     if threads < 2 or len(starts) < 2:

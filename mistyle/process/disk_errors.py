@@ -1,4 +1,4 @@
-"""What went wrong with a disk or a file, as a sentence: full, not to be written, taken away, not there any more."""
+"""Errors of disks and files as messages: disk full, not writable, removed while in use, missing."""
 
 import contextlib
 import errno
@@ -17,15 +17,15 @@ BROKEN = tuple(
     getattr(errno, name) for name in ("EIO", "ENXIO", "ENODEV", "ESTALE", "EREMOTEIO") if hasattr(errno, name)
 )
 PROBE = 1 << 20
-NOTHING = "nothing half-written was left there"
+NOTHING = "no partial file remains"
 
 
 @contextlib.contextmanager
-def told(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Turn what goes wrong with writing `path` into a MistyleError; anything else passes through.
+def translated(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Turn disk errors while writing `path` into a MistyleError; other errors pass through.
 
-    `temporary` is the file or folder that is written meanwhile. A writer that hides the system's error (a library's
-    RuntimeError, an OSError without number) is asked again: a probe is written beside it.
+    `temporary` is the file or folder that is written meanwhile. Some writers hide the system's error (a library's
+    RuntimeError, an OSError without errno). A probe file written beside the target then finds the cause.
     """
     try:
         yield
@@ -43,7 +43,7 @@ def _sentence(error: Exception, path: Path, temporary: Path | None) -> MistyleEr
     if temporary is not None and _gone(temporary, code, named):
         return MistyleError(
             f"{_shown(temporary.parent)}: this folder was removed while it was being written to. "
-            "Run the same command again, which begins anew"
+            "Run the same command again to start anew"
         )
     if code is None:
         code = _probed(temporary if temporary is not None and temporary.is_dir() else path.parent, temporary)
@@ -57,13 +57,13 @@ def _sentence(error: Exception, path: Path, temporary: Path | None) -> MistyleEr
         )
     if code == errno.EFBIG:
         return MistyleError(
-            f"{path}: a file grew beyond what is allowed here ({os.strerror(code)}); {NOTHING}. "
+            f"{path}: a file exceeded the allowed size ({os.strerror(code)}); {NOTHING}. "
             "Raise the limit (ulimit -f), or choose an output folder on another disk, and run the same command again"
         )
     if code in BROKEN and inside:
         return MistyleError(
             f"{path}: the disk, or the connection to it, failed ({os.strerror(code)}). "
-            "See to it, and run the same command again"
+            "Check the disk, and run the same command again"
         )
     if code == errno.EROFS or (code in NOT_TO_BE_WRITTEN and inside):
         return UsageError(
@@ -79,19 +79,19 @@ def _sentence(error: Exception, path: Path, temporary: Path | None) -> MistyleEr
 
 
 def _gone(temporary: Path, code: int | None, named: Path | None) -> bool:
-    """Whether what is written to was taken away: its folder, or itself."""
+    """Whether the temporary file or its folder was removed."""
     return not temporary.parent.is_dir() or (
         code == errno.ENOENT and named is not None and _within(named, temporary) and not temporary.exists()
     )
 
 
 def _shown(path: Path) -> Path:
-    """The path as it will be called when it is complete."""
+    """The path under its final name."""
     return Path(*(re.sub(r"^\.(.+)\.tmp-.+-\d+-\d+(\.\w+)?$", r"\1", part) for part in path.parts))
 
 
 def _probed(folder: Path, temporary: Path | None) -> int | None:
-    """What the system says to another megabyte in the folder, or of a file that stands at the allowed size."""
+    """The errno of writing another megabyte to the folder; EFBIG where a file has the largest allowed size."""
     limit = _largest_file()
     if limit is not None and temporary is not None and temporary.exists():
         every = temporary.rglob("*") if temporary.is_dir() else [temporary]
@@ -100,9 +100,9 @@ def _probed(folder: Path, temporary: Path | None) -> int | None:
     probe = folder / f".probe.tmp-{os.getpid()}"
     try:
         with open(probe, "wb", buffering=0) as file:
-            left = PROBE if limit is None else min(PROBE, limit)
-            while left > 0:
-                left -= file.write(b"\0" * left) or 0
+            remaining = PROBE if limit is None else min(PROBE, limit)
+            while remaining > 0:
+                remaining -= file.write(b"\0" * remaining) or 0
             os.fsync(file.fileno())
     except OSError as error:
         return error.errno
@@ -113,7 +113,7 @@ def _probed(folder: Path, temporary: Path | None) -> int | None:
 
 
 def _largest_file() -> int | None:
-    """How large a file may become, where the system limits that."""
+    """The file size limit (RLIMIT_FSIZE) in bytes; None without one."""
     try:
         import resource
     except ImportError:  # Windows
@@ -132,15 +132,15 @@ def _within(path: Path, folder: Path) -> bool:
 
 
 def unexpected(error: OSError) -> MistyleError | None:
-    """The sentence for a file that could not be used outside of what `told` watches: an input that has vanished.
+    """The message for a file error outside `translated`, for example a vanished input.
 
-    None for what only a mistake in mistyle itself explains.
+    None for errors that only a defect of mistyle explains.
     """
     named = _named(error)
     if error.errno in FULL:
         where = "" if named is None else f"{named}: "
         return MistyleError(f"{where}the disk is full ({os.strerror(error.errno or 0)}); free some space and run again")
-    if error.errno is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):  # NumPy's words
+    if error.errno is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):  # NumPy's message
         return MistyleError(
             f"a file could not be written to its end ({error}): the disk is full, or files may not grow so large. The "
             f"folder for temporary files counts too ({tempfile.gettempdir()}; TMPDIR names another); run again"
@@ -149,7 +149,7 @@ def unexpected(error: OSError) -> MistyleError | None:
         return None
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
         return InputRefused(
-            f"{named}: found nothing; it was removed or renamed while the job ran, or never was there. "
+            f"{named}: found nothing; it was removed or renamed while the job ran, or never existed. "
             "Put it back, and run the same command again"
         )
     if error.errno in NOT_TO_BE_WRITTEN:

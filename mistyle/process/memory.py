@@ -1,9 +1,8 @@
-"""How much memory this process holds and held, how it keeps within a budget, and what the C library does with memory
-that is given back.
+"""Memory of this process: current and peak use, a budget, and the C library's heap thresholds.
 
-Within a budget (`within`) the large arrays of a job lie in files instead of in memory of the process's own: what
-`empty`, `copied`, `away` and `load` give are then maps of unlinked files, whose pages the kernel takes back whenever it
-likes, and which a thread lets go as soon as the process holds too much. What is computed does not change.
+Within a budget (`within`) the large arrays of a job lie in files. `empty`, `copied`, `away` and `load` then return maps
+of unlinked files. The kernel may evict their pages at any time, and a thread releases them as soon as the process
+exceeds its limit. Results do not change.
 """
 
 import contextlib
@@ -23,14 +22,14 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike
 
-# mallopt's names for numbers; from how many bytes on a block is mapped on its own, and how much free heap is kept.
+# Parameters of mallopt: the block size from which malloc uses mmap, and the free heap that it retains.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 DEFAULT = 128 * 1024
 MOST = 2**30
 
 
 def trim() -> None:
-    """Give free blocks back to the system. Does nothing where there is no glibc."""
+    """Return free heap blocks to the system. Does nothing without glibc."""
     library = _glibc()
     if library is not None:
         library.malloc_trim(0)
@@ -43,10 +42,10 @@ def _glibc() -> Any:
 
 @contextmanager
 def kept() -> Iterator[None]:
-    """Inside, freed blocks stay with the process; what is free at the end goes back to the system.
+    """Retain freed heap blocks inside the context; return free memory to the system at its end.
 
-    A loop that makes and drops pictures of tens of megabytes otherwise has the kernel hand out, and clear, all their
-    pages anew at every turn. Does nothing where there is no glibc.
+    Otherwise the kernel allocates and clears all pages anew in every iteration of a loop over pictures of tens of
+    megabytes. Does nothing without glibc.
     """
     library = _glibc()
     if library is None:
@@ -63,14 +62,14 @@ def kept() -> Iterator[None]:
 
 
 def limit(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Bytes of main memory that this process can get: the machine's, or what a control group (v1 or v2) or one of the
-    groups around it leaves of them; None where nothing tells. `proc` and `groups` are where the kernel shows them."""
-    found = [_total(proc), *_group_limits(proc, groups)]
-    return min((n for n in found if n is not None), default=None)
+    """Bytes of main memory that this process can get: the machine's, or the limit of a control group (v1 or v2) or one
+    of its parents; None where unknown. `proc` and `groups` are the mount points of procfs and cgroupfs."""
+    limits = [_total(proc), *_group_limits(proc, groups)]
+    return min((n for n in limits if n is not None), default=None)
 
 
 def _total(proc: Path) -> int | None:
-    """The machine's main memory."""
+    """The machine's main memory in bytes; None where unknown."""
     try:
         lines = (proc / "meminfo").read_text(encoding="ascii", errors="replace").splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemTotal:"))
@@ -83,9 +82,9 @@ def _total(proc: Path) -> int | None:
 
 
 def _group_limits(proc: Path, groups: Path) -> Iterator[int]:
-    """What the groups that this process is in allow, from its own up to the root.
+    """Memory limits (bytes) of this process's control groups, from its own up to the root.
 
-    In a container the path may be the host's, of which nothing is to be seen; the root is the container's own then.
+    In a container the path may be the host's and not visible; the root is then the container's own group.
     """
     try:
         lines = (proc / "self/cgroup").read_text(encoding="utf-8", errors="replace").splitlines()
@@ -105,11 +104,11 @@ def _group_limits(proc: Path, groups: Path) -> Iterator[int]:
                 continue
 
 
-_seen = [0]  # bytes: the highest that was told; the kernel's own mark is reset, and lacks some pages of each core
+_seen = [0]  # bytes: the highest returned so far; the kernel's own peak is reset, and lacks some pages of each core
 
 
 def resident() -> int:
-    """Bytes of main memory that this process holds now; 0 where nothing tells (not Linux)."""
+    """Bytes of main memory that this process holds now; 0 where unknown (not Linux)."""
     return _status("VmRSS")
 
 
@@ -121,14 +120,14 @@ def highest() -> int:
 
 @contextmanager
 def watched() -> Iterator[Callable[[], int]]:
-    """Yields a function that tells the most bytes this process has held since the block began.
+    """Yields a function that returns the peak memory (bytes) of this process since the block began.
 
-    Linux keeps the mark itself, so nothing is missed between two looks, and lets it be set back; where it cannot be
-    (another system, a closed /proc) the answer is the most that was held so far. A child that ends within the block and
-    was larger than all before it counts as well. Blocks do not nest: the inner one sets the outer one's mark back.
+    Linux records the peak itself, so no peak is missed between two readings, and it can be reset. Where it cannot be
+    reset (another system, a closed /proc), the result is the peak so far. A child that ends within the block and was
+    larger than all before it counts as well. Blocks do not nest: the inner one resets the outer one's peak.
     """
     children = _of("RUSAGE_CHILDREN")
-    highest()  # kept, for what follows forgets it
+    highest()  # recorded now, since the reset clears it
     reset = _reset()
 
     def most() -> int:
@@ -149,7 +148,7 @@ def _reset() -> bool:
 
 
 def _of(whom: str) -> int:
-    """The most bytes held by RUSAGE_SELF or by one of RUSAGE_CHILDREN; 0 where nothing tells (Windows)."""
+    """Peak bytes of RUSAGE_SELF or of one of RUSAGE_CHILDREN; 0 where unknown (Windows)."""
     try:
         import resource
     except ImportError:
@@ -161,16 +160,16 @@ def _status(name: str) -> int:
     """A line of /proc/self/status in bytes."""
     try:
         with open("/proc/self/status", encoding="ascii", errors="replace") as file:
-            found = next((line for line in file if line.startswith(name + ":")), "")
+            entry = next((line for line in file if line.startswith(name + ":")), "")
     except OSError:
         return 0
-    return int(found.split()[1]) * 1024 if found else 0
+    return int(entry.split()[1]) * 1024 if entry else 0
 
 
-LEAST = 2**20  # bytes from which on an array is worth a file
-MARGIN = 0.8  # of the budget, from which on mapped pages are let go
-EVERY = 0.005  # seconds between two looks
-_scratch: list[Path] = []  # where files go; empty without a budget
+LEAST = 2**20  # bytes: smaller arrays stay in memory
+MARGIN = 0.8  # share of the budget above which mapped pages are released
+EVERY = 0.005  # seconds between two readings
+_scratch: list[Path] = []  # folder of the files; empty without a budget
 _limit = [float("inf")]
 _mapped: "weakref.WeakSet[mmap.mmap]" = weakref.WeakSet()
 T = TypeVar("T")
@@ -178,10 +177,10 @@ T = TypeVar("T")
 
 @contextmanager
 def within(budget: float, folder: Path | None) -> Iterator[None]:
-    """Keep large arrays in files of `folder` (None: in memory, as outside), and what is held near `budget` bytes.
+    """Keep large arrays in files of `folder` (None: in memory, as outside), and resident memory near `budget` bytes.
 
-    What has to be in memory at one time, above all the working arrays of a stage, is not made smaller by this: whether
-    a job can keep its budget is for `jobs/memory_budget.py` to say. Blocks do not nest.
+    The working set of a stage does not shrink: `jobs/memory_budget.py` decides whether a job fits its budget. Blocks do
+    not nest.
     """
     if folder is None:
         yield
@@ -203,12 +202,12 @@ def within(budget: float, folder: Path | None) -> Iterator[None]:
 
 
 def possible() -> bool:
-    """Whether this system lets a process give up mapped pages and tells it how much it holds."""
+    """Whether this system can release mapped pages and reports resident memory."""
     return sys.platform.startswith("linux")
 
 
 def tight() -> bool:
-    """Whether large arrays go to files now."""
+    """Whether a budget is active: large arrays go to files."""
     return bool(_scratch)
 
 
@@ -259,16 +258,16 @@ def load(path: Path) -> np.ndarray:
     """An array of a .npy file; where there is a budget, a large one is mapped and cannot be written to."""
     if not _scratch or path.stat().st_size < LEAST:
         return np.load(path, allow_pickle=False)
-    found = np.load(path, mmap_mode="r", allow_pickle=False)
-    _mapped.add(found._mmap)
-    return np.asarray(found)
+    mapped = np.load(path, mmap_mode="r", allow_pickle=False)
+    _mapped.add(mapped._mmap)
+    return np.asarray(mapped)
 
 
 def _file(count: int) -> mmap.mmap:
-    """So many bytes of a file without a name: nothing stays of it, however the process ends."""
+    """`count` bytes of a file without a name, which vanishes however the process ends."""
     _let_go()
     with tempfile.TemporaryFile(dir=_scratch[0]) as file:
-        # Allocated at once: a disk that is full later would end the process with a signal.
+        # Allocated at once: a full disk would later end the process with SIGBUS.
         os.posix_fallocate(file.fileno(), 0, count)
         data = mmap.mmap(file.fileno(), count)
     _mapped.add(data)
@@ -281,13 +280,13 @@ def _watch(done: threading.Event) -> None:
 
 
 def _let_go() -> None:
-    """Take mapped pages out of the process while it holds more than its limit; they stay in the kernel's cache."""
+    """Release mapped pages while the process exceeds its limit; they stay in the kernel's cache."""
     if _resident_now() > _limit[0]:
         let_go()
 
 
 def let_go() -> None:
-    """Take all mapped pages out of the process; before a call into a library that lets no other thread run."""
+    """Release all mapped pages; call it before a library call that lets no other thread run."""
     for data in list(_mapped):
         with contextlib.suppress(ValueError, OSError):  # closed meanwhile
             data.madvise(mmap.MADV_DONTNEED)

@@ -1,7 +1,7 @@
-"""Requests to stop: what the signals of a person, a queue or a parent process do to a run.
+"""Stop requests: signals from a user, a queue or a parent process.
 
 SIGTERM, a closed terminal and on Windows Ctrl-Break end the run with `Stopped`, Ctrl-C with KeyboardInterrupt;
-whatever was finished stays. A second Ctrl-C ends the process at once, which a run survives as any other death.
+finished stages stay. A second Ctrl-C ends the process at once; a run survives it as any other kill.
 """
 
 import _thread
@@ -17,12 +17,12 @@ from typing import Any
 
 from mistyle.core.errors import Stopped
 
-AGAIN = 0.05  # seconds until a request that was lost on the way is made once more
+AGAIN = 0.05  # seconds until a lost request is repeated
 
 
 @dataclass
 class _State:
-    """What was asked for: the signal; whether its exception is on the way; how many loops hold it back."""
+    """The request: its signal, whether its exception has been raised, and how many loops defer it."""
 
     asked: int | None = None
     raised: bool = False
@@ -36,26 +36,25 @@ _state = _State()
 
 @contextlib.contextmanager
 def listening() -> Iterator[None]:
-    """Answer signals while this runs (only in the main thread), as before afterwards; ignored ones stay ignored.
+    """Handle signals inside the context (main thread only), then restore the handlers; ignored signals stay ignored.
 
-    Where a Ctrl-C ended it, the next one ends the process at once until it is over: what Python does at its end
-    would answer with tracebacks.
+    After a Ctrl-C, the next one ends the process at once: Python's shutdown would print tracebacks.
     """
     global _state
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    answers = {n: answer for n, answer in _answers().items() if signal.getsignal(n) is not signal.SIG_IGN}
-    before = {number: signal.signal(number, answer) for number, answer in answers.items()}
+    handlers = {n: handler for n, handler in _answers().items() if signal.getsignal(n) is not signal.SIG_IGN}
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     hook, sys.unraisablehook = sys.unraisablehook, _lost(sys.unraisablehook)
     _state = _State()
     try:
         yield
     finally:
         sys.unraisablehook = hook
-        for number, answer in before.items():
+        for number, handler in before.items():
             if number != signal.SIGINT or _state.asked != signal.SIGINT:
-                signal.signal(number, answer)
+                signal.signal(number, handler)
         if _state.asked != signal.SIGINT:
             _state = _State()
 
@@ -67,12 +66,12 @@ def _answers() -> dict[int, Callable[[int, FrameType | None], None]]:
 
 
 def asked() -> bool:
-    """Whether the run was asked to stop: the place for long loops to write their checkpoint and then `check()`."""
+    """Whether a stop was requested; a long loop then writes its checkpoint and calls `check()`."""
     return _state.asked is not None
 
 
 def check() -> None:
-    """End here if the run was asked to stop: Stopped or KeyboardInterrupt."""
+    """Raise Stopped or KeyboardInterrupt if a stop was requested."""
     if _state.asked is None:
         return
     _state.raised = True
@@ -83,7 +82,7 @@ def check() -> None:
 
 @contextlib.contextmanager
 def at_checkpoints(patience: float = 10.0) -> Iterator[None]:
-    """For loops that look at `asked()` themselves: a request to stop waits for them, `patience` seconds at most."""
+    """For loops that poll `asked()`: a stop request waits for them, `patience` seconds at most."""
     _state.holding, _state.patience = _state.holding + 1, patience
     try:
         yield
@@ -94,7 +93,7 @@ def at_checkpoints(patience: float = 10.0) -> Iterator[None]:
 
 def _stop(number: int, frame: FrameType | None) -> None:
     if _state.raised:
-        return  # on its way; what swallows it meets check() at the next stage
+        return  # raised already; code that swallows it meets check() at the next stage
     _state.asked = number
     if _state.holding > 0 and not _state.waited:
         _state.waited = True
@@ -105,7 +104,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     if _state.asked == signal.SIGINT:
-        # Nothing of Python's own end: it would wait for threads.
+        # Without Python's shutdown, which would wait for threads.
         os._exit(130)
     _state.asked = number
     check()
@@ -118,7 +117,7 @@ def _later(number: int, seconds: float) -> None:
 
 
 def _lost(before: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A request that reached the process inside a finalizer or a callback is swallowed there: make it once more."""
+    """Repeat a request whose exception a finalizer or a callback swallowed."""
 
     def hook(unraisable: Any) -> None:
         if isinstance(unraisable.exc_value, (KeyboardInterrupt, Stopped)) and asked():

@@ -1,10 +1,10 @@
 """Weights of networks from files: safetensors, checked and mapped in place; all others only through a child process.
 
 A safetensors file is eight bytes of header length, a JSON header {name: {dtype, shape, data_offsets}} and raw
-little-endian data. Checked before anything is used: the header's length (at most HEADER_LIMIT), every type, shape and
-range, that the data lie inside the file without overlaps. A pickle (.pth, .bin, .pt, .ckpt) can run code when it is
-opened: process/weights_worker.py opens it, with `weights_only=True`, limits on memory and time and no right to write,
-and hands back the same layout; it also unpacks .npz archives.
+little-endian data. These are checked before use: the header's length (at most HEADER_LIMIT), every type, shape and
+range, and that the data lie inside the file without overlaps. A pickle (.pth, .bin, .pt, .ckpt) can run code when it
+is opened. process/weights_worker.py opens it with `weights_only=True`, limits on memory and time and no right to write,
+and returns the same layout; it also unpacks .npz archives.
 """
 
 import json
@@ -27,7 +27,7 @@ PATIENCE = 600.0  # seconds for a pickle, torch's start included
 
 
 def header(path: Path) -> tuple[dict[str, Any], int]:
-    """The checked header of a safetensors file, '__metadata__' included, and where its data begin.
+    """The checked header of a safetensors file, '__metadata__' included, and the byte offset of its data.
 
     Raises InputRefused for anything that safetensors does not allow.
     """
@@ -45,7 +45,7 @@ def header(path: Path) -> tuple[dict[str, Any], int]:
 
 
 def _check(table: Any, size: int) -> None:
-    """The header's entries against each other and the `size` bytes of data behind it."""
+    """Check the header's entries against each other and against the `size` bytes of data."""
     if not isinstance(table, dict):
         raise ValueError("a header that is not a table")
     spans = []
@@ -72,10 +72,9 @@ def _check(table: Any, size: int) -> None:
 
 
 def tensors(path: Path) -> dict[str, Any]:
-    """Name to torch tensor of a .safetensors file (mapped, copied page by page where it is written to), an .npz
-    archive, or a pickle of a table of tensors, whatever its ending. Raises InputRefused.
+    """Name to torch tensor of a .safetensors file, an .npz archive, or a pickle of a table of tensors with any ending.
 
-    Types that torch has no numbers for (8-bit floats) are passed over.
+    A .safetensors file is mapped copy-on-write. Raises InputRefused. Types that torch lacks (8-bit floats) are skipped.
     """
     if Path(path).suffix.lower() == ".safetensors":
         table, start = header(path)
@@ -85,8 +84,7 @@ def tensors(path: Path) -> dict[str, Any]:
 
 
 def converted(path: Path) -> dict[str, Any]:
-    """The tensors of a pickle or an .npz archive, opened in a child process; anything but a table of tensors is
-    refused."""
+    """The tensors of a pickle or an .npz archive, opened in a child process. InputRefused for any other content."""
     paths = os.pathsep.join(p for p in (str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")) if p)
     if not path.is_file():
         raise InputRefused(f"{path}: no such file of weights.")
@@ -121,16 +119,16 @@ def _views(table: dict[str, Any], data: np.ndarray) -> dict[str, Any]:
         **{"I64": torch.int64, "I32": torch.int32, "I16": torch.int16, "I8": torch.int8, "U8": torch.uint8},
         **{"BOOL": torch.bool, "C64": torch.complex64},
     }
-    found = {}
+    result = {}
     for name, entry in table.items():
         if name == "__metadata__" or entry["dtype"] not in kinds:
             continue
         begin, end = entry["data_offsets"]
         if begin == end:
-            found[name] = torch.zeros(entry["shape"], dtype=kinds[entry["dtype"]])
+            result[name] = torch.zeros(entry["shape"], dtype=kinds[entry["dtype"]])
             continue
         part = data[begin:end]
         if part.ctypes.data % SIZES[entry["dtype"]]:
             part = part.copy()
-        found[name] = torch.from_numpy(part).view(kinds[entry["dtype"]]).reshape(entry["shape"])
-    return found
+        result[name] = torch.from_numpy(part).view(kinds[entry["dtype"]]).reshape(entry["shape"])
+    return result

@@ -1,11 +1,10 @@
-"""Opens one file of weights that is not safetensors, in a process of its own, and writes its tensors to the output as
-safetensors does.
+"""Worker process: reads a weight file that is not safetensors and writes its tensors to stdout as safetensors.
 
-Run by process/weights.py as `python -m mistyle.process.weights_worker FILE`. torch opens pickles with
-`weights_only=True`: tensors, numbers, texts and tables, and nothing that could run; an .npz archive is opened without
-pickles, if it unpacks to at most MAX_RATIO times its size. No file can be written here (RLIMIT_FSIZE 0), the address
-space is limited to 8 GiB and four times the file, the processor time to five minutes; on Windows, which has no such
-limits, only the ways of opening hold.
+process/weights.py runs it as `python -m mistyle.process.weights_worker FILE`. torch opens pickles with
+`weights_only=True`: tensors, numbers, texts and tables, no code. An .npz archive is opened without pickles, if it
+unpacks to at most MAX_RATIO times its size. The process can write no file (RLIMIT_FSIZE 0). Its address space is
+limited to 8 GiB plus four times the file, its processor time to five minutes. Windows has no such limits; there only
+the restricted readers protect.
 """
 
 import json
@@ -23,8 +22,8 @@ TYPES |= {"|b1": "BOOL"}
 
 
 def main(path: str) -> None:
-    """Write the tensors, or end with one sentence on the error output."""
-    answers = os.dup(1)
+    """Write the tensors, or exit with a one-sentence message on stderr."""
+    output = os.dup(1)
     os.dup2(2, 1)
     opened = _archive if path.lower().endswith(".npz") else _pickle
     if opened is _pickle:
@@ -34,30 +33,30 @@ def main(path: str) -> None:
         table = opened(path)
     except MemoryError:
         sys.exit("it takes too much memory")
-    except Exception as error:  # whatever a damaged or hostile file brings about
+    except Exception as error:  # any error of a damaged or hostile file
         first = (str(error).splitlines() or [""])[0]
         sys.exit(f"not a plain table of tensors, so it was not opened: {type(error).__name__}: {first[:200]}")
-    with os.fdopen(answers, "wb") as out:
+    with os.fdopen(output, "wb") as out:
         _write(table, out)
 
 
 def _pickle(path: str) -> dict[str, tuple[str, np.ndarray]]:
-    """Name to safetensors' type and the numbers (bfloat16 as its bytes)."""
+    """Name to safetensors type and array (bfloat16 as int16 bits)."""
     import torch
 
     state = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(state, dict):
         sys.exit(f"holds a {type(state).__name__}; expected a dictionary of tensors")
-    found = {}
+    result = {}
     for name, value in state.items():
         if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
             sys.exit(f"expected a table of tensors; '{str(name)[:80]}' is a {type(value).__name__}")
         value = value.detach().contiguous()
         if value.dtype == torch.bfloat16:
-            found[str(name)] = ("BF16", value.view(torch.int16).numpy())
+            result[str(name)] = ("BF16", value.view(torch.int16).numpy())
         else:
-            found[str(name)] = _typed(str(name), value.numpy())
-    return found
+            result[str(name)] = _typed(str(name), value.numpy())
+    return result
 
 
 def _archive(path: str) -> dict[str, tuple[str, np.ndarray]]:

@@ -1,8 +1,8 @@
-"""From a bare Python to a working mistyle: makes .venv, installs the pins, makes sure of LLVM. Standard library only.
+"""Set-up of mistyle on a bare Python: creates .venv, installs the pins, finds LLVM. Standard library only.
 
 `start` is what `python3 -m mistyle` runs. Everything lands in `.venv` beside the package (never in an active conda, uv
-or other environment); `.venv/mistyle.json` remembers what was done, so that a later run only compares a hash.
-A wheel that is installed somewhere else runs in the environment that it was installed into.
+or other environment); `.venv/mistyle.json` records the set-up, so that a later run only compares a hash.
+A wheel installed elsewhere runs in the environment that it was installed into.
 """
 
 import contextlib
@@ -29,16 +29,16 @@ from mistyle.setup.environment import (
     read_record,
     ready,
     say,
-    told,
+    with_llvm,
     write_record,
 )
 
-ENTERED = "_MISTYLE_ENTERED"  # set for the process that the set-up hands over to
+ENTERED = "_MISTYLE_ENTERED"  # set in the environment of the process that replaces the set-up
 HELP = "mistyle: one mesh and one style picture in; the same mesh with stylized, physically based textures out.\n"
 
 
 def start(arguments: Sequence[str], command_line: Callable[[list[str]], int], doctor: Callable[[bool], int]) -> int:
-    """Make sure of everything, go over into .venv's Python, run the verb there and return its exit code.
+    """Complete the set-up, switch to .venv's Python, run the verb there and return its exit code.
 
     `--system` lets apt-get install LLVM on the system; every other argument belongs to the verb. `command_line` runs a
     verb. `doctor` prints what is missing, as JSON or as a table, where the set-up failed.
@@ -67,7 +67,7 @@ def start(arguments: Sequence[str], command_line: Callable[[list[str]], int], do
 
 
 def _help(arguments: list[str], command_line: Callable[[list[str]], int]) -> int:
-    """Answer at once, on a bare Python too: only where the command line cannot be imported it needs the packages."""
+    """Print the help, on a bare Python too; set up the packages only where the command line cannot be imported."""
     try:
         return command_line(arguments)
     except ImportError as error:
@@ -79,7 +79,7 @@ def _help(arguments: list[str], command_line: Callable[[list[str]], int]) -> int
 
 
 def _tests(arguments: list[str]) -> int:
-    # Most tests keep one core busy. A file's tests stay together: they share what its fixtures made.
+    # Most tests use one core. A file's tests run in one worker: they share its fixtures.
     whole = ["--numprocesses=auto", "--maxprocesses=4", "--dist=loadfile"]
     chosen = arguments[arguments.index("test") + 1 :] or whole
     return _hand_over([sys.executable, "-m", "pytest", *chosen], dict(os.environ), ROOT)
@@ -87,15 +87,15 @@ def _tests(arguments: list[str]) -> int:
 
 def enter(arguments: Sequence[str], *, extras: set[str], system: bool = False) -> None:
     """Set up what is missing; return only inside the right Python with LLVM's variables set, else run it instead."""
-    folder, here = home(), inside()
-    if os.environ.pop(ENTERED, "") == str(folder) and here:
+    folder, right_python = home(), inside()
+    if os.environ.pop(ENTERED, "") == str(folder) and right_python:
         return
     if system or not ready(folder, extras):
         set_up(folder, extras, system)
     record = read_record(folder)
     say(_banner(folder, record))
-    environment = told(record["llvm"]["library"], record["llvm"]["folders"], os.environ)
-    if here and environment.get("LD_LIBRARY_PATH") == os.environ.get("LD_LIBRARY_PATH"):
+    environment = with_llvm(record["llvm"]["library"], record["llvm"]["folders"], os.environ)
+    if right_python and environment.get("LD_LIBRARY_PATH") == os.environ.get("LD_LIBRARY_PATH"):
         os.environ.update(environment)
         return
     sys.exit(_over(arguments, environment))
@@ -103,14 +103,14 @@ def enter(arguments: Sequence[str], *, extras: set[str], system: bool = False) -
 
 def _over(arguments: Sequence[str], environment: dict[str, str]) -> int:
     """Run the same verb with .venv's Python."""
-    # Another environment's packages must not be found before ours.
-    kept = {k: v for k, v in environment.items() if k not in ("PYTHONHOME", "PYTHONPATH", "__PYVENV_LAUNCHER__")}
+    # Another environment's packages must not precede ours on the path.
+    clean = {k: v for k, v in environment.items() if k not in ("PYTHONHOME", "PYTHONPATH", "__PYVENV_LAUNCHER__")}
     folder = home()
-    return _hand_over([str(python_of(folder)), "-P", "-m", "mistyle", *arguments], {**kept, ENTERED: str(folder)})
+    return _hand_over([str(python_of(folder)), "-P", "-m", "mistyle", *arguments], {**clean, ENTERED: str(folder)})
 
 
 def _hand_over(line: list[str], environment: dict[str, str], folder: Path | None = None) -> int:
-    """Become another program, so that signals and the exit code are its own; Windows can only wait for it."""
+    """Replace this process by another program, so that signals and the exit code are its own; Windows waits for it."""
     sys.stdout.flush()
     sys.stderr.flush()
     if os.name == "nt":
@@ -136,7 +136,7 @@ def _banner(folder: Path, record: dict[str, Any]) -> str:
 
 
 def set_up(folder: Path, extras: set[str], system: bool) -> None:
-    """Make the virtual environment, install the packages, make sure of LLVM; whatever is there already is kept."""
+    """Make the virtual environment, install the packages, find LLVM; existing parts are kept."""
     from mistyle.setup import install, llvm
 
     begun = time.monotonic()
@@ -148,8 +148,8 @@ def set_up(folder: Path, extras: set[str], system: bool) -> None:
             extras = extras | set(record.get("extras", ()))
             if not packages_ready(folder, record, extras):
                 if in_clone():
-                    say("the packages come first: on a bare machine about 1 GB to fetch and 2 GB on the disk")
-                    say(f"with the CUDA build of torch (a GPU, or no CPU build to be had) it adds {install.CUDA_SIZE}")
+                    say("installing the packages: on a bare machine about 1 GB to download and 2 GB on the disk")
+                    say(f"with the CUDA build of torch (a GPU, or no CPU build available) it adds {install.CUDA_SIZE}")
                 if record:
                     write_record(folder, {k: v for k, v in record.items() if k != "key"})
                 install.packages(folder, python_of(folder), extras)
@@ -169,17 +169,17 @@ def _find_llvm(folder: Path) -> dict[str, Any]:
 
     say("looking for an LLVM that compiles (each is tried on one pixel)")
     python = str(python_of(folder))
-    found = llvm.find(python, folder, say)
-    if not found and llvm.fetch(folder, say):
-        found = llvm.find(python, folder, say)
-    if not found:
+    variant = llvm.find(python, folder, say)
+    if not variant and llvm.fetch(folder, say):
+        variant = llvm.find(python, folder, say)
+    if not variant:
         raise SetupError(
             f"no LLVM that Dr.Jit can use (17 or newer), and no GPU answers. Run: {llvm.command()}"
             + ("; or the same verb with --system" if os.path.exists("/usr/bin/apt-get") else "")
         )
-    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
-    refused = {"refused": asked} if asked and asked != found.library else {}
-    return {**found._asdict(), "print": print_of(found.library), **refused}
+    requested = os.environ.get("DRJIT_LIBLLVM_PATH")
+    refused = {"refused": requested} if requested and requested != variant.library else {}
+    return {**variant._asdict(), "print": print_of(variant.library), **refused}
 
 
 @contextlib.contextmanager
@@ -201,9 +201,9 @@ def _alone(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _stoppable() -> Iterator[None]:
-    """SIGTERM ends the set-up and the program that it waits for with exit code 75: it can be taken up again."""
+    """SIGTERM ends the set-up and its child program with exit code 75; rerun to resume."""
 
-    # Nothing is said in the handler: it may have interrupted another line being said.
+    # The handler prints nothing: it may have interrupted another print.
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(75))
     try:
         yield

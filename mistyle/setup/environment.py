@@ -1,6 +1,6 @@
-"""Where mistyle stands and what the set-up left there: places, notes, the LLVM for Dr.Jit. Standard library only.
+"""Paths of the installation and the record of the set-up: virtual environment, pins, LLVM. Standard library only.
 
-The set-up (`bootstrap.py`, `install.py`, `llvm.py`) writes it. The renderer, `mistyle doctor` and `mistyle
+The set-up (`bootstrap.py`, `install.py`, `llvm.py`) writes the record. The renderer, `mistyle doctor` and `mistyle
 pack` read it.
 """
 
@@ -22,7 +22,7 @@ CONSTRAINTS = PACKAGE / "constraints.txt"
 
 
 class SetupError(Exception):
-    """The environment cannot be made; the message is one sentence with the way out. Exit code 4."""
+    """The environment cannot be made; the message is one sentence with the fix. Exit code 4."""
 
 
 def say(line: str) -> None:
@@ -31,13 +31,13 @@ def say(line: str) -> None:
 
 
 def in_clone() -> bool:
-    """Whether this package stands in its repository (else it was installed as a wheel)."""
+    """Whether this package lies in its repository (else it was installed as a wheel)."""
     project = ROOT / "pyproject.toml"
     return project.is_file() and '\nname = "mistyle"' in project.read_text(encoding="utf-8")
 
 
 def home() -> Path:
-    """Where the set-up keeps its notes and a private LLVM: .venv, or the user's cache for an installed wheel."""
+    """Folder of the set-up's record and of a private LLVM: .venv, or the user's cache for an installed wheel."""
     if in_clone():
         return VENV
     cache = os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -57,7 +57,7 @@ def inside() -> bool:
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """What an earlier set-up noted: key, extras, llvm (variant, library, folders, version, size, mtime)."""
+    """The record of an earlier set-up: key, extras, llvm (variant, library, folders, version, size, mtime)."""
     with contextlib.suppress(OSError, ValueError):
         record = json.loads((folder / "mistyle.json").read_text(encoding="utf-8"))
         return record if isinstance(record, dict) else {}
@@ -65,14 +65,14 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def write_record(folder: Path, record: dict[str, Any]) -> None:
-    """Replace the note of the set-up as a whole."""
+    """Replace the record of the set-up atomically."""
     part = folder / "mistyle.json.part"
     part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     os.replace(part, folder / "mistyle.json")
 
 
 def key(folder: Path) -> str:
-    """Changes when what has to be installed changes: the pins, the project, the place, the Python."""
+    """Hash of everything that determines the installation: the pins, the project, the path, the Python."""
     digest = hashlib.sha256(CONSTRAINTS.read_bytes())
     if in_clone():
         project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -81,82 +81,82 @@ def key(folder: Path) -> str:
         from importlib.metadata import distributions
 
         digest.update(str([d.version for d in distributions(name="drjit")]).encode())
-    # The link of a virtual environment may lead to another version after a system upgrade.
+    # A virtual environment's symlink may point to another version after a system upgrade.
     digest.update(f"{PACKAGE} {os.path.basename(os.path.realpath(python_of(folder)))}".encode())
     return digest.hexdigest()
 
 
 def ready(folder: Path, extras: set[str]) -> bool:
-    """Whether nothing is left to do. A few milliseconds: compares hashes, starts no process."""
+    """Whether the set-up is complete. Takes a few milliseconds: compares hashes, starts no process."""
     record = read_record(folder)
     return packages_ready(folder, record, extras) and llvm_ready(record)
 
 
 def packages_ready(folder: Path, record: dict[str, Any], extras: set[str]) -> bool:
-    """Whether the packages and `extras` were installed for the pins and the Python of today."""
+    """Whether the packages and `extras` were installed for the current pins and Python."""
     if "key" not in record or not python_of(folder).exists():
         return False
     return record["key"] == key(folder) and extras <= set(record.get("extras", ()))
 
 
 def llvm_ready(record: dict[str, Any]) -> bool:
-    """Whether the LLVM of the note is still there, and the user names no other."""
+    """Whether the recorded LLVM still exists, and the user names no other."""
     llvm = record.get("llvm")
     if not llvm:
         return False
-    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if asked and llvm["library"] and asked not in (llvm["library"], llvm.get("refused")):
+    requested = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if requested and llvm["library"] and requested not in (llvm["library"], llvm.get("refused")):
         return False
     return not llvm["library"] or print_of(llvm["library"]) == llvm["print"]
 
 
 def print_of(library: str) -> list[int]:
-    """Size and time of change of a library (bytes, ns), by which the next run knows it; nothing where it is gone."""
+    """Fingerprint of a library: size (bytes) and modification time (ns); an empty list where it is missing."""
     with contextlib.suppress(OSError):
         info = os.stat(library)
         return [info.st_size, info.st_mtime_ns]
     return []
 
 
-def told(library: str, folders: Sequence[str], base: Mapping[str, str]) -> dict[str, str]:
-    """`base` with what makes Dr.Jit load `library`; `folders` hold libraries that LLVM needs and the system lacks."""
+def with_llvm(library: str, folders: Sequence[str], base: Mapping[str, str]) -> dict[str, str]:
+    """`base` with the variables that make Dr.Jit load `library`; `folders` hold dependencies that the system lacks."""
     result = dict(base)
     if library:
         result["DRJIT_LIBLLVM_PATH"] = library
     if folders:
-        there = [f for f in result.get("LD_LIBRARY_PATH", "").split(os.pathsep) if f and f not in folders]
-        result["LD_LIBRARY_PATH"] = os.pathsep.join([*folders, *there])
+        inherited = [f for f in result.get("LD_LIBRARY_PATH", "").split(os.pathsep) if f and f not in folders]
+        result["LD_LIBRARY_PATH"] = os.pathsep.join([*folders, *inherited])
     return result
 
 
 def known_llvm() -> str:
-    """The LLVM that the set-up found, where it is still there; else nothing."""
+    """Path of the LLVM that the set-up found; empty where it no longer exists."""
     record = read_record(home())
     return record["llvm"]["library"] if llvm_ready(record) else ""
 
 
 def use_llvm() -> bool:
-    """Tell Dr.Jit in this process about the LLVM that the set-up found; for scripts and tests that start without it.
+    """Set the LLVM that the set-up found for Dr.Jit in this process; for scripts and tests that start without it.
 
-    Returns whether there is one. Has to run before the first import of drjit or mitsuba; changes nothing where
+    Returns whether an LLVM is set. Must run before the first import of drjit or mitsuba. Changes nothing where
     DRJIT_LIBLLVM_PATH is set already.
     """
     record = read_record(home())
     if os.environ.get("DRJIT_LIBLLVM_PATH") or not llvm_ready(record):
         return bool(os.environ.get("DRJIT_LIBLLVM_PATH"))
-    os.environ.update(told(record["llvm"]["library"], record["llvm"]["folders"], os.environ))
+    os.environ.update(with_llvm(record["llvm"]["library"], record["llvm"]["folders"], os.environ))
     if folders := record["llvm"]["folders"]:
         _preload([path for folder in folders for path in sorted(glob.glob(f"{folder}/*.so.*"))])
     return True
 
 
 def _preload(libraries: list[str]) -> None:
-    """Load libraries whose folder the loader was not told of at its start, each after those that it needs."""
+    """Load libraries from folders outside the loader's search path, dependencies first."""
     import ctypes
 
-    left = [path for path in libraries if not os.path.islink(path)]
-    for _ in range(len(left)):
-        for path in list(left):
+    pending = [path for path in libraries if not os.path.islink(path)]
+    for _ in range(len(pending)):
+        for path in list(pending):
             with contextlib.suppress(OSError):
                 ctypes.CDLL(path, mode=ctypes.RTLD_GLOBAL)
-                left.remove(path)
+                pending.remove(path)

@@ -1,4 +1,4 @@
-"""What this machine has, what is missing, and the command that fixes each. Standard library only.
+"""Facts of `mistyle doctor`: installed parts, missing parts, and the command that fixes each. Standard library only.
 
 It runs on a Python without any package, too. Versions come from the packages' metadata, and each Mitsuba variant is
 tried in a process of its own.
@@ -23,7 +23,7 @@ from mistyle.setup import environment, install, llvm
 State = Literal["ok", "missing", "optional"]
 
 VARIANTS = ("llvm_ad_rgb", "metal_ad_rgb" if sys.platform == "darwin" else "cuda_ad_rgb")
-# What each optional feature imports, and the names to install. Nothing in the main job needs them.
+# Each optional feature: its imports, and the packages to install. The main job needs none of them.
 OPTIONAL = {
     "diffusion stylizers": (("diffusers", "transformers", "peft"), "diffusers transformers peft accelerate"),
     "ray": (("ray",), "ray"),
@@ -33,7 +33,7 @@ OPTIONAL = {
 
 
 class Row(NamedTuple):
-    """One finding. `fix` is a command (or a few words) where something can be done, else empty."""
+    """One finding. `fix` is a command (or a short instruction), empty where nothing can be done."""
 
     name: str
     found: str
@@ -42,14 +42,13 @@ class Row(NamedTuple):
 
 
 def rows(cores: int) -> list[Row]:
-    """Everything that was looked at, in the order in which it is shown, on `cores` processor cores. Takes a second or
-    two."""
+    """All findings in display order; `cores` is the number of processor cores to report. Takes a second or two."""
     return [*_machine(cores), *_packages(), *_renderers(), *_torch(), *_optional()]
 
 
-def works(found: Sequence[Row]) -> bool:
+def works(findings: Sequence[Row]) -> bool:
     """Whether the main job can run."""
-    return all(row.state != "missing" for row in found)
+    return all(row.state != "missing" for row in findings)
 
 
 def _machine(cores: int) -> list[Row]:
@@ -68,7 +67,7 @@ def _machine(cores: int) -> list[Row]:
 
 
 def _memory() -> float:
-    """Gigabytes of main memory; 0 where the system does not tell."""
+    """Gigabytes of main memory; 0 where unknown."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     except (AttributeError, ValueError, OSError):
@@ -77,18 +76,20 @@ def _memory() -> float:
 
 def _packages() -> list[Row]:
     pins = re.findall(r"^([\w.-]+)==([\w.]+)$", environment.CONSTRAINTS.read_text(encoding="utf-8"), re.MULTILINE)
-    there = {name: _version(name) for name, _ in pins}
-    lost = [name for name in ("mitsuba", "torch", "numpy", "trimesh", "pydantic") if not there.get(name)]
-    if lost:
+    installed = {name: _version(name) for name, _ in pins}
+    missing = [name for name in ("mitsuba", "torch", "numpy", "trimesh", "pydantic") if not installed.get(name)]
+    if missing:
         return [
-            Row("packages", f"missing: {', '.join(lost)}", "missing", "python3 -m mistyle doctor   (installs them)")
+            Row("packages", f"missing: {', '.join(missing)}", "missing", "python3 -m mistyle doctor   (installs them)")
         ]
-    other = [f"{n} {there[n]} for {pin}" for n, pin in pins if there[n] and there[n].split("+")[0] != pin]
-    if other:
+    differing = [
+        f"{n} {installed[n]} for {pin}" for n, pin in pins if installed[n] and installed[n].split("+")[0] != pin
+    ]
+    if differing:
         project = f"-e {environment.ROOT}" if environment.in_clone() else "mistyle"
         fix = f"{sys.executable} -m pip install -c {environment.CONSTRAINTS} {project}"
-        return [Row("packages", f"not the tested versions: {', '.join(other)}", "optional", fix)]
-    return [Row("packages", f"{sum(map(bool, there.values()))} as pinned", "ok")]
+        return [Row("packages", f"not the tested versions: {', '.join(differing)}", "optional", fix)]
+    return [Row("packages", f"{sum(map(bool, installed.values()))} as pinned", "ok")]
 
 
 def _version(name: str) -> str:
@@ -102,37 +103,37 @@ def _renderers() -> list[Row]:
     if not _version("mitsuba"):
         return [Row("mitsuba", "not installed", "missing")]
     library = os.environ.get("DRJIT_LIBLLVM_PATH", "")
-    tries = [llvm.Found(v, library if v.startswith("llvm") else "") for v in VARIANTS]
+    variants = [llvm.Variant(v, library if v.startswith("llvm") else "") for v in VARIANTS]
     with ThreadPoolExecutor() as pool:
-        answers = dict(zip(VARIANTS, pool.map(lambda found: llvm.probe(sys.executable, found), tries), strict=True))
+        answers = dict(zip(VARIANTS, pool.map(lambda v: llvm.probe(sys.executable, v), variants), strict=True))
     any_works = any(answer.works for answer in answers.values())
     result = [Row("mitsuba", _version("mitsuba"), "ok")]
     for variant, answer in answers.items():
         state: State = "ok" if answer.works else "optional" if any_works else "missing"
         if answer.works or variant.startswith("llvm"):
-            words = "renders and back-propagates" if answer.works else f"does not work: {answer.why}"
-            result.append(Row(f"  {variant}", words, state, "" if any_works else llvm.command()))
+            state_text = "renders and back-propagates" if answer.works else f"does not work: {answer.why}"
+            result.append(Row(f"  {variant}", state_text, state, "" if any_works else llvm.command()))
         else:
             result.append(Row(f"  {variant}", "does not answer", "optional"))
     if answers["llvm_ad_rgb"].works:
         result.append(Row("LLVM", f"{answers['llvm_ad_rgb'].version} ({library or 'found by Dr.Jit'})", "ok"))
     else:
-        seen = ", ".join(map(str, llvm.candidates(environment.home(), None))) or "none"
-        result.append(Row("LLVM", f"none that works; looked at {seen}", "optional" if any_works else "missing"))
+        examined = ", ".join(map(str, llvm.candidates(environment.home(), None))) or "none"
+        result.append(Row("LLVM", f"none that works; looked at {examined}", "optional" if any_works else "missing"))
     return result
 
 
 def _torch() -> list[Row]:
     gpu = _gpu()
-    there = [Row("GPU", gpu or "none; everything runs on the CPU", "ok" if gpu else "optional")]
+    result = [Row("GPU", gpu or "none; everything runs on the CPU", "ok" if gpu else "optional")]
     number = _version("torch")
     if not number:
-        return [*there, Row("torch", "not installed", "missing")]
+        return [*result, Row("torch", "not installed", "missing")]
     cuda = _torch_cuda()
     row = Row("torch", f"{number} ({f'CUDA {cuda}' if cuda else 'CPU build'})", "ok")
     if gpu and not cuda and install.nvidia():
         row = Row("torch", f"{row.found}: an NVIDIA GPU answers, torch cannot use it", "optional", _afresh())
-    return [*there, row]
+    return [*result, row]
 
 
 def _afresh() -> str:
@@ -158,7 +159,7 @@ def _gpu() -> str:
 
 
 def _words(*line: str) -> str:
-    """What a program prints, or nothing when it fails or does not answer in time."""
+    """A program's standard output; empty when it fails or times out."""
     try:
         done = subprocess.run(line, capture_output=True, text=True, timeout=30)
     except (OSError, subprocess.TimeoutExpired):
@@ -170,9 +171,9 @@ def _optional() -> list[Row]:
     pip = f"{environment.python_of(environment.home())} -m pip install -c {environment.CONSTRAINTS}"
     result = []
     for name, (modules, packages) in OPTIONAL.items():
-        lost = [module for module in modules if find_spec(module) is None]
-        found = f"not installed: {', '.join(lost)}" if lost else "installed"
-        result.append(Row(name, found, "optional" if lost else "ok", f"{pip} {packages}" if lost else ""))
+        missing = [module for module in modules if find_spec(module) is None]
+        text = f"not installed: {', '.join(missing)}" if missing else "installed"
+        result.append(Row(name, text, "optional" if missing else "ok", f"{pip} {packages}" if missing else ""))
     result.append(_weights())
     node = _words("node", "--version") if shutil.which("node") else ""
     fix = "" if node else "install Node.js (nodejs.org); only the tests' glTF validator uses it"
@@ -188,5 +189,5 @@ def _weights() -> Row:
         "and name it: export MISTYLE_VGG=FILE, or mistyle stylize … --vgg FILE"
     )
     if path:
-        return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which is not there", "optional", fix)
+        return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which does not exist", "optional", fix)
     return Row("VGG-19 weights", "none; the embedded features need none", "optional", fix)

@@ -1,4 +1,4 @@
-"""Making the virtual environment and installing the pinned packages into it. Standard library only."""
+"""Virtual environment and installation of the pinned packages. Standard library only."""
 
 import hashlib
 import os
@@ -52,12 +52,12 @@ def _check_installed() -> None:
 
 
 def make_venv(venv: Path, python: Path) -> None:
-    """A virtual environment without pip. One that works is kept, whoever made it; one that mistyle made and that broke
-    (its Python is gone or is another version now) is made anew."""
+    """Create a virtual environment without pip. A working one is kept, whoever made it. A broken one of mistyle's own
+    (its Python is missing or has another version) is recreated."""
     version = _version_of(python)
     config = (venv / "pyvenv.cfg").read_text(encoding="utf-8") if (venv / "pyvenv.cfg").is_file() else ""
-    made_for = re.search(r"^version(?:_info)? = (\d+)\.(\d+)", config, re.MULTILINE)
-    if version and made_for and version == (int(made_for[1]), int(made_for[2])):
+    created_for = re.search(r"^version(?:_info)? = (\d+)\.(\d+)", config, re.MULTILINE)
+    if version and created_for and version == (int(created_for[1]), int(created_for[2])):
         if version < (3, 11):
             raise SetupError(f"{venv} has Python {version[0]}.{version[1]}, mistyle needs 3.11 or newer; move it away")
         return
@@ -93,7 +93,7 @@ def _python_command() -> str:
     return f"install Python {version} from python.org with its pip and venv"
 
 
-# pip, where the Python comes without it (Debian and Ubuntu split ensurepip off into python3-venv)
+# pip, where Python lacks it (Debian and Ubuntu ship ensurepip in python3-venv)
 
 
 def ensure_pip(python: Path, venv: Path) -> None:
@@ -118,13 +118,13 @@ def _ensurepip(python: Path, venv: Path) -> Iterator[list[str]]:
 
 def _disk(python: Path, venv: Path, folder: Path = Path("/usr/share/python-wheels")) -> Iterator[list[str]]:
     for wheel in sorted(folder.glob("pip-*.whl"), reverse=True):
-        # A wheel is a zip that Python can run from, so pip can install itself.
+        # Python can run a wheel (a zip), so pip can install itself.
         yield [str(python), f"{wheel}/pip", "install", "--no-index", "--no-deps", str(wheel)]
 
 
 def _other_pip(python: Path, venv: Path) -> Iterator[list[str]]:
-    for other in dict.fromkeys(filter(None, [sys.executable, shutil.which("python3")])):
-        yield [other, "-m", "pip", "--python", str(python), "install", "--no-deps", "pip"]
+    for interpreter in dict.fromkeys(filter(None, [sys.executable, shutil.which("python3")])):
+        yield [interpreter, "-m", "pip", "--python", str(python), "install", "--no-deps", "pip"]
 
 
 def _registry(python: Path, venv: Path) -> Iterator[list[str]]:
@@ -165,7 +165,7 @@ def _debian(python: Path, venv: Path) -> Iterator[list[str]]:
 # torch, whose build depends on the machine
 
 # torch 2.13.0 for Linux with the packages of CUDA that constraints.txt pins: sums of their wheels' sizes, packed and
-# unpacked, as the registry and the wheels' own directories have them. A new pin needs new numbers.
+# unpacked, from the registry and the wheels' own directories. A new pin needs new numbers.
 CUDA_FETCH_BYTES, CUDA_DISK_BYTES = 2.7e9, 4.7e9
 CUDA_SIZE = f"{CUDA_FETCH_BYTES / 1e9:.1f} GB to fetch with its packages, {CUDA_DISK_BYTES / 1e9:.1f} GB on the disk"
 
@@ -173,9 +173,9 @@ CUDA_SIZE = f"{CUDA_FETCH_BYTES / 1e9:.1f} GB to fetch with its packages, {CUDA_
 def install_torch(python: Path, venv: Path) -> None:
     """The pinned torch: on a machine with an NVIDIA GPU the CUDA build, else one without gigabytes of CUDA packages.
 
-    A CPU build is looked for where pip is configured to look, then among PyTorch's own CPU wheels; the plain registry
-    comes last (on Linux its torch brings CUDA along, and works without a GPU). The dependencies of torch are installed
-    with the other packages, and pinned like them.
+    pip looks for a CPU build in its configured index, then among PyTorch's own CPU wheels. The plain registry comes
+    last (on Linux its torch includes CUDA, and works without a GPU). The dependencies of torch are installed with the
+    other packages, and pinned like them.
     """
     pin = re.search(r"^torch==([\w.]+)$", CONSTRAINTS.read_text(encoding="utf-8"), re.MULTILINE)
     assert pin, f"{CONSTRAINTS} has no line torch==VERSION"
@@ -192,25 +192,25 @@ def install_torch(python: Path, venv: Path) -> None:
     raise SetupError(failure)
 
 
-def _check_room(venv: Path, needed: float, what: str) -> None:
+def _check_room(venv: Path, needed: float, part: str) -> None:
     free = shutil.disk_usage(venv).free
     if free < needed:
         raise SetupError(
-            f"{venv} has {free / 1e9:.1f} GB of free disk space, {what} needs {needed / 1e9:.1f} GB; make room and run "
+            f"{venv} has {free / 1e9:.1f} GB of free disk space, {part} needs {needed / 1e9:.1f} GB; make room and run "
             "the same command again"
         )
 
 
 def torch_ways(version: str, gpu: bool, system: str) -> list[tuple[str, list[str]]]:
-    """What to try in turn: a few words, and pip's arguments."""
+    """Attempts in order: a description, and pip's arguments."""
     heavy = f"; no CPU build was found, so this is the CUDA build: {CUDA_SIZE}" if system == "linux" else ""
     plain = (f"the plain registry{heavy}", [f"torch=={version}"])
     if gpu and system == "win32":
         return [("PyTorch's CUDA wheels", ["--index-url", CUDA_WHEELS, f"torch=={version}"]), plain]
     if gpu:
-        # Three signs: exactly this string, so that a CPU build (2.13.0+cpu) in a configured folder is not taken.
-        found = f"an NVIDIA GPU answers, so this is the CUDA build: {CUDA_SIZE}"
-        return [(found, [f"torch==={version}"]), ("any build", [f"torch=={version}"])]
+        # "===" compares the exact string, so that a CPU build (2.13.0+cpu) in a configured folder is not taken.
+        description = f"an NVIDIA GPU answers, so this is the CUDA build: {CUDA_SIZE}"
+        return [(description, [f"torch==={version}"]), ("any build", [f"torch=={version}"])]
     if system != "linux":
         return [plain]
     quick, cpu = ["--retries", "1", "--timeout", "20"], f"torch=={version}+cpu"
@@ -232,7 +232,7 @@ def nvidia() -> bool:
 
 
 def pip(python: Path, venv: Path, *arguments: str) -> str:
-    """`pip install` into `venv`; returns "" or one sentence that says what went wrong. The output is in setup.log."""
+    """`pip install` into `venv`; returns "" or a one-sentence error message. The output is in setup.log."""
     line = [
         str(python),
         "-I",
@@ -244,15 +244,17 @@ def pip(python: Path, venv: Path, *arguments: str) -> str:
         "--no-input",
         "--prefer-binary",
     ]
-    # Settings that would lead the packages somewhere else do not count here; where to look for packages does.
-    kept = {k: v for k, v in os.environ.items() if k not in ("PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PYTHONPATH")}
-    kept |= {"PIP_USER": "0", "PIP_REQUIRE_VIRTUALENV": "1"}
-    log, begun, said = venv / "setup.log", time.monotonic(), []
-    with open(log, "a", encoding="utf-8") as notes:
-        notes.write(f"\n$ {' '.join([*line, *arguments])}\n")
+    # Settings that redirect the installation are dropped; settings of the package index are kept.
+    environment = {
+        k: v for k, v in os.environ.items() if k not in ("PIP_TARGET", "PIP_PREFIX", "PIP_ROOT", "PYTHONPATH")
+    }
+    environment |= {"PIP_USER": "0", "PIP_REQUIRE_VIRTUALENV": "1"}
+    log, begun, output = venv / "setup.log", time.monotonic(), []
+    with open(log, "a", encoding="utf-8") as log_file:
+        log_file.write(f"\n$ {' '.join([*line, *arguments])}\n")
         with subprocess.Popen(
             [*line, "--progress-bar", "off", *arguments],
-            env=kept,
+            env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -262,13 +264,13 @@ def pip(python: Path, venv: Path, *arguments: str) -> str:
         ) as child:
             try:
                 for text in child.stdout or ():
-                    notes.write(text)
-                    said.append(text)
+                    log_file.write(text)
+                    output.append(text)
                     if news := _news(text):
                         say(f"  {time.monotonic() - begun:4.0f} s  {news}")
             finally:
                 child.terminate()
-    return "" if child.returncode == 0 else f"{_sentence(''.join(said))}. The whole output is in {log}"
+    return "" if child.returncode == 0 else f"{_sentence(''.join(output))}. The whole output is in {log}"
 
 
 def _news(line: str) -> str:
@@ -281,7 +283,7 @@ def _news(line: str) -> str:
 
 
 def _sentence(output: str) -> str:
-    """What pip's output means, for someone who has never seen pip fail."""
+    """pip's failure as one sentence, for a user who has never seen pip fail."""
     if "No space left on device" in output:
         return "the disk is full; make room and run the same command again"
     if cause := re.search(UNREACHABLE, output):
@@ -289,15 +291,15 @@ def _sentence(output: str) -> str:
             f"pip cannot reach its package registry ({cause[0]}); check the network, the proxy and `pip config list`, "
             "then rerun to resume"
         )
-    # The second is what pip says of a single package that is pinned twice and not there at all.
-    if lost := re.search(r"No matching distribution found for (\S+)|Cannot install (\S+) because", output):
-        there = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    # pip prints the second message for a single package that is pinned twice and does not exist.
+    if missing := re.search(r"No matching distribution found for (\S+)|Cannot install (\S+) because", output):
+        system = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
         return (
-            f"the registry cannot be reached or has no {lost[1] or lost[2]} for {there} (mistyle is tested with "
+            f"the registry cannot be reached or has no {missing[1] or missing[2]} for {system} (mistyle is tested with "
             "3.11, 3.12 and 3.13)"
         )
     errors = re.findall(r"^\s*(?:ERROR|error): (.+)$", output, re.MULTILINE)
-    return f"pip failed: {errors[-1].strip().rstrip('.') if errors else 'it gave no reason'}"
+    return f"pip failed: {errors[-1].strip().rstrip('.') if errors else 'it printed no reason'}"
 
 
 def _run(*line: str, cwd: str | None = None, timeout: float | None = None) -> subprocess.CompletedProcess[str]:

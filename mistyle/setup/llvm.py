@@ -1,8 +1,7 @@
-"""An LLVM that Dr.Jit can compile with: found on the system, else fetched privately. Standard library only.
+"""Search for an LLVM that Dr.Jit can use: on the system, else downloaded privately. Standard library only.
 
-Which versions work cannot be read off their numbers: Dr.Jit 1.5 refuses LLVM 14, and 15 and 16 end the whole process
-when the first kernel is compiled, which no Python code can catch. So every candidate is tried in a process of its own
-that renders and back-propagates one pixel.
+Version numbers do not decide: Dr.Jit 1.5 refuses LLVM 14, while 15 and 16 abort the process when the first kernel is
+compiled, which Python cannot catch. So a child process tries every candidate: it renders and back-propagates one pixel.
 """
 
 import os
@@ -17,11 +16,11 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from mistyle.setup.environment import told
+from mistyle.setup.environment import with_llvm
 
 Say = Callable[[str], None]
 
-# Newest tested first; a distribution offers one or two of them.
+# The newest tested version first; a distribution offers one or two of them.
 PACKAGES = ("libllvm19", "libllvm20", "libllvm21", "libllvm22", "libllvm18", "libllvm17t64", "libllvm17")
 RETRIES = ("-o", "Acquire::Retries=3")
 PLACES = (
@@ -58,15 +57,15 @@ print("pixel", "good" if 0.1 < shown[0] < 2 and felt[0] > 0 else "wrong", versio
 
 
 class Answer(NamedTuple):
-    """What one probe said: `why` is its last words where it does not work."""
+    """The result of one probe; `why` is its last error line where it fails."""
 
     works: bool
     version: str = ""
     why: str = ""
 
 
-class Found(NamedTuple):
-    """A Mitsuba variant that works; `library` and `folders` are what Dr.Jit has to be told ("" and none on a GPU)."""
+class Variant(NamedTuple):
+    """A Mitsuba variant; `library` and `folders` are Dr.Jit's LLVM settings ("" and none on a GPU)."""
 
     variant: str
     library: str = ""
@@ -74,14 +73,14 @@ class Found(NamedTuple):
     version: str = ""
 
 
-def probe(python: str, found: Found, timeout: float = 120) -> Answer:
+def probe(python: str, variant: Variant, timeout: float = 120) -> Answer:
     """Render and back-propagate one pixel with `python` in a process of its own, which may abort."""
     with tempfile.TemporaryDirectory() as scratch:
-        # A cache of its own: a kernel that another LLVM compiled would be loaded, and this one never tried.
-        environment = told(found.library, found.folders, {**os.environ, "DRJIT_CACHE_DIR": scratch})
+        # A separate cache: otherwise Dr.Jit loads a kernel that another LLVM compiled, and never tries this one.
+        environment = with_llvm(variant.library, variant.folders, {**os.environ, "DRJIT_CACHE_DIR": scratch})
         try:
             done = subprocess.run(
-                [python, "-I", "-c", PROBE, found.variant],
+                [python, "-I", "-c", PROBE, variant.variant],
                 env=environment,
                 cwd=scratch,
                 capture_output=True,
@@ -92,9 +91,9 @@ def probe(python: str, found: Found, timeout: float = 120) -> Answer:
             )
         except subprocess.TimeoutExpired:
             return Answer(False, why=f"no answer in {timeout:g} s")
-    words = re.search(r"^pixel good ?(\S*)$", done.stdout, re.MULTILINE)
-    if done.returncode == 0 and words:
-        return Answer(True, version=words[1])
+    match = re.search(r"^pixel good ?(\S*)$", done.stdout, re.MULTILINE)
+    if done.returncode == 0 and match:
+        return Answer(True, version=match[1])
     return Answer(False, why=_why(done.returncode, done.stdout + done.stderr))
 
 
@@ -117,11 +116,11 @@ def _why(code: int, output: str) -> str:
     return lines[-1][:200] if lines else f"ended with code {code}"
 
 
-def candidates(home: Path, asked: str | None, places: tuple[str, ...] = PLACES) -> list[Path]:
-    """Libraries worth a probe: what DRJIT_LIBLLVM_PATH asks for, our private one, then the system's, newest first."""
+def candidates(home: Path, requested: str | None, places: tuple[str, ...] = PLACES) -> list[Path]:
+    """Libraries to probe: that of DRJIT_LIBLLVM_PATH, our private one, then the system's, newest first."""
     private = sorted(_glob(str(home / "llvm/usr/lib/*-linux-gnu/libLLVM*.so*")))
     system = {Path(os.path.realpath(p)) for pattern in places for p in _glob(pattern)}
-    ordered = [Path(asked)] if asked else []
+    ordered = [Path(requested)] if requested else []
     ordered += [p for p in private if not p.is_symlink()] + sorted(system, key=_version, reverse=True)
     return list(dict.fromkeys(p for p in ordered if p.is_file()))
 
@@ -132,26 +131,26 @@ def _glob(pattern: str) -> Iterator[Path]:
 
 
 def _version(path: Path) -> tuple[int, str]:
-    """The version that the file's name tells; a name without one (libLLVM.dylib) is the package manager's newest."""
+    """The version in the file's name; a name without one (libLLVM.dylib) is the package manager's newest."""
     number = re.search(r"(?:libLLVM-?|so\.)(\d+)", path.name)
     return (int(number[1]) if number else 999, path.as_posix())
 
 
-def find(python: str, home: Path, say: Say) -> Found | None:
-    """The first variant that answers: CUDA, Metal, then LLVM with each candidate library."""
-    gpu = Found("metal_ad_rgb" if sys.platform == "darwin" else "cuda_ad_rgb")
+def find(python: str, home: Path, say: Say) -> Variant | None:
+    """The first variant that works: CUDA, Metal, then LLVM with each candidate library."""
+    gpu = Variant("metal_ad_rgb" if sys.platform == "darwin" else "cuda_ad_rgb")
     if has_gpu() and probe(python, gpu).works:
         return gpu
-    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
-    ours = tuple(
+    requested = os.environ.get("DRJIT_LIBLLVM_PATH")
+    private = tuple(
         str(p) for p in [*_glob(str(home / "llvm/usr/lib/*-linux-gnu")), *_glob(str(home / "llvm/lib/*-linux-gnu"))]
     )
-    for library in candidates(home, asked):
-        for folders in ((), ours) if ours else ((),):
-            found = Found("llvm_ad_rgb", str(library), folders)
-            answer = probe(python, found)
+    for library in candidates(home, requested):
+        for folders in ((), private) if private else ((),):
+            variant = Variant("llvm_ad_rgb", str(library), folders)
+            answer = probe(python, variant)
             if answer.works:
-                return found._replace(version=answer.version)
+                return variant._replace(version=answer.version)
         say(f"{library} cannot be used: {answer.why}")
     return None
 
@@ -162,7 +161,7 @@ def has_gpu() -> bool:
 
 
 def fetch(home: Path, say: Say) -> bool:
-    """Unpack Debian's or Ubuntu's libllvm, libatomic1 and what they need into `home`/llvm, without being root.
+    """Unpack Debian's or Ubuntu's libllvm, libatomic1 and their dependencies into `home`/llvm, without root.
 
     Nothing outside `home` is changed: where the system's package lists are missing or stale, private ones are made.
     """
@@ -189,15 +188,15 @@ def _download(home: Path, package: str, options: list[str], say: Say) -> bool:
     planned = _run([*install, package, "libatomic1"])
     if planned.returncode != 0:
         return False
-    # Each line names what this system lacks: 'URI' libllvm19_1%3a19.1.7-3_amd64.deb SIZE HASH.
+    # Each line names a package that this system lacks: 'URI' libllvm19_1%3a19.1.7-3_amd64.deb SIZE HASH.
     files = [line.split()[1].split("_") for line in planned.stdout.splitlines() if line.startswith("'")]
-    wanted = [f"{name}={unquote(version)}" for name, version, _ in files if not name.startswith("libc6")]
-    if not wanted:
+    packages = [f"{name}={unquote(version)}" for name, version, _ in files if not name.startswith("libc6")]
+    if not packages:
         return False
     say(f"fetching {' '.join(name for name, _, _ in files)} into {home / 'llvm'} (the system is not changed)")
     with tempfile.TemporaryDirectory(dir=home) as scratch:
         os.chmod(scratch, 0o755)  # apt-get downloads as its own user when root calls it
-        if _run(["apt-get", *options, *RETRIES, "-q", "download", *wanted], cwd=scratch).returncode != 0:
+        if _run(["apt-get", *options, *RETRIES, "-q", "download", *packages], cwd=scratch).returncode != 0:
             return False
         for deb in sorted(Path(scratch).glob("*.deb")):
             if _run(["dpkg-deb", "-x", str(deb), str(Path(scratch) / "llvm")]).returncode != 0:
@@ -208,7 +207,7 @@ def _download(home: Path, package: str, options: list[str], say: Say) -> bool:
 
 
 def install(say: Say) -> bool:
-    """Install it on the system with apt-get, as root or through sudo; what --system asks for."""
+    """Install LLVM on the system with apt-get, as root or through sudo (option --system)."""
     if not shutil.which("apt-get"):
         return False
     root = [] if os.geteuid() == 0 else ["sudo"]

@@ -44,7 +44,7 @@ def test_without_a_working_variant_the_command_is_named(monkeypatch):
 
 def test_weights_that_are_named_but_absent_are_told(monkeypatch, tmp_path):
     monkeypatch.setenv("MISTYLE_VGG", str(tmp_path / "vgg.pth"))
-    assert facts._weights().state == "optional" and "not there" in facts._weights().found
+    assert facts._weights().state == "optional" and "does not exist" in facts._weights().found
     (tmp_path / "vgg.pth").touch()
     assert facts._weights().state == "ok"
 

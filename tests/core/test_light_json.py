@@ -69,7 +69,7 @@ def test_views_with_lights_of_their_own():
 
 
 def test_a_misspelt_view_is_not_given_the_common_lights():
-    with pytest.raises(InputRefused, match="'B', which is none of the 1 views"):
+    with pytest.raises(InputRefused, match="'B', which is not one of the 1 views"):
         lights_of_views(through_text((SUN,), {"B": (FLASH,)}), ["b"])
 
 

@@ -183,10 +183,10 @@ def test_dr_jit_that_came_too_early_is_said(monkeypatch):
 
 
 def test_private_folders_come_first_and_once():
-    once = environment.told("/l/libLLVM.so", ["/l"], {"LD_LIBRARY_PATH": "/a:/b", "HOME": "/h"})
+    once = environment.with_llvm("/l/libLLVM.so", ["/l"], {"LD_LIBRARY_PATH": "/a:/b", "HOME": "/h"})
     assert once == {"DRJIT_LIBLLVM_PATH": "/l/libLLVM.so", "LD_LIBRARY_PATH": "/l:/a:/b", "HOME": "/h"}
-    assert environment.told("/l/libLLVM.so", ["/l"], once) == once
-    assert environment.told("", [], {"HOME": "/h"}) == {"HOME": "/h"}
+    assert environment.with_llvm("/l/libLLVM.so", ["/l"], once) == once
+    assert environment.with_llvm("", [], {"HOME": "/h"}) == {"HOME": "/h"}
 
 
 @pytest.mark.parametrize(("script", "code"), [("exit 7", 7), ("kill -TERM $$", -signal.SIGTERM)])

@@ -151,7 +151,7 @@ def test_pip_is_kept_inside_the_environment(tmp_path, monkeypatch):
         ("ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device", "disk is full"),
         ("ERROR: No matching distribution found for xatlas==0.0.11", "no xatlas==0.0.11 for Python"),
         ("noise\nERROR: Cannot unpack file x.\n", "pip failed: Cannot unpack file x"),
-        ("", "gave no reason"),
+        ("", "printed no reason"),
     ],
 )
 def test_failures_become_one_sentence(tmp_path, output, sentence):

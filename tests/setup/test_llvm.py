@@ -55,14 +55,14 @@ def system(tmp_path: Path) -> str:
 def test_the_installed_llvm_draws_a_pixel_and_garbage_does_not(tmp_path):
     record = environment.read_record(environment.home()).get("llvm") or {"variant": "llvm_ad_rgb", "folders": []}
     library = os.environ.get("DRJIT_LIBLLVM_PATH", record.get("library", ""))
-    answer = llvm.probe(sys.executable, llvm.Found(record["variant"], library, tuple(record["folders"])))
+    answer = llvm.probe(sys.executable, llvm.Variant(record["variant"], library, tuple(record["folders"])))
     assert answer.works, answer.why
     if not library:
         return
     assert int(answer.version.split(".")[0]) >= 17
     garbage = tmp_path / "libLLVM.so.19.1"
     garbage.write_bytes(b"no library")
-    answer = llvm.probe(sys.executable, llvm.Found("llvm_ad_rgb", str(garbage)))
+    answer = llvm.probe(sys.executable, llvm.Variant("llvm_ad_rgb", str(garbage)))
     assert not answer.works
     assert answer.why
 
@@ -77,7 +77,7 @@ def test_the_installed_llvm_draws_a_pixel_and_garbage_does_not(tmp_path):
     ],
 )
 def test_a_probe_survives_what_the_library_does(tmp_path, script, why):
-    answer = llvm.probe(str(program(tmp_path / "python", script)), llvm.Found("llvm_ad_rgb", "/x"), timeout=0.5)
+    answer = llvm.probe(str(program(tmp_path / "python", script)), llvm.Variant("llvm_ad_rgb", "/x"), timeout=0.5)
     assert not answer.works
     assert why in answer.why
 
@@ -86,7 +86,7 @@ def test_a_probe_is_told_the_library_and_has_a_kernel_cache_of_its_own(tmp_path,
     """With a shared cache a kernel that another LLVM compiled would be loaded, and this one never tried."""
     monkeypatch.setenv("DRJIT_CACHE_DIR", "/shared")
     script = '[ "$DRJIT_CACHE_DIR" != /shared ] && echo pixel good "$DRJIT_LIBLLVM_PATH:$LD_LIBRARY_PATH"'
-    found = llvm.Found("llvm_ad_rgb", "/l/libLLVM.so", ("/l",))
+    found = llvm.Variant("llvm_ad_rgb", "/l/libLLVM.so", ("/l",))
     monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
     answer = llvm.probe(str(program(tmp_path / "python", script)), found)
     assert answer == llvm.Answer(True, "/l/libLLVM.so:/l")
@@ -104,7 +104,7 @@ def test_every_candidate_is_tried_until_one_works(private, monkeypatch, tmp_path
     libraries = [tmp_path / "a", tmp_path / "b", tmp_path / "c"]
     tried = []
 
-    def probe(python: str, found: llvm.Found, timeout: float = 0) -> llvm.Answer:
+    def probe(python: str, found: llvm.Variant, timeout: float = 0) -> llvm.Answer:
         tried.append((found.library, bool(found.folders)))
         works = found.library.endswith("b") and bool(found.folders)
         return llvm.Answer(works, "19.1.7" if works else "", "LLVM ERROR: Cannot select")

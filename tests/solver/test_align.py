@@ -82,7 +82,7 @@ def test_similarities():
     flat = points * [1, 1, 0]
     assert fit_similarity(flat, applied(TRUE, flat)) == pytest.approx(TRUE)
     for wrong in (np.diag([1.0, 1, -1, 1]), np.diag([1.0, 1, 2, 1]), np.diag([1.0, 1, 1, 2])):
-        with pytest.raises(ValueError, match="no similarity"):
+        with pytest.raises(ValueError, match="not a similarity"):
             scale_of(wrong)
 
 

@@ -1,4 +1,4 @@
-"""`camera.json` and `transforms.json`: cameras as other programs know them, written and read back with care.
+"""Camera files `camera.json` and `transforms.json`: writer and reader.
 
 `camera.json` is `{"version": 1, "space": ..., "views": [view, ...]}`; a view has
 
@@ -6,19 +6,19 @@
     azimuth, elevation                      degrees, or null
     opencv  {R, t, z_min, z_max}            x_cam = R x_world + t; x right, y down, z forward; z_min: nearest
     opengl  {R, t, z_min, z_max}            y up, z backward: z is negative, z_max: nearest (paper 4.1.3)
-    exr, png, png_sha256                    the view's files beside it, and what the PNG's bytes were when written
+    exr, png, png_sha256                    the view's files beside it, and the PNG's sha256 when written
 
-z_min and z_max are null where nothing is seen. On reading, R and t of one of the two conventions are enough. The space
-is the working space: the mesh in a bounding sphere of radius 1 about the origin, Y up.
+z_min and z_max are null where the view is empty. On reading, R and t of one of the two conventions are enough. The
+space is the working space: the mesh in a bounding sphere of radius 1 about the origin, Y up.
 
-`transforms.json` is the NeRF/Blender convention: `transform_matrix` is world from camera with OpenGL axes. Ours says
-with "space" that it is in the working space; another's is in whatever space its maker chose. nerfstudio turns and
-scales the world of its reconstruction: stored = applied_scale * (applied_transform @ original). That is undone here.
+`transforms.json` is the NeRF/Blender convention: `transform_matrix` is world from camera with OpenGL axes. In ours,
+"space" declares the working space; those of other programs are in their own space. nerfstudio transforms the space of
+its reconstruction: stored = applied_scale * (applied_transform @ original). The reader inverts this.
 
-Every camera describes either the pixels that a picture file stores or those of the upright picture, which a viewer
-shows (EXIF orientation): `CameraFrame.pixels` says which. COLMAP and the readers of transforms.json (nerfstudio,
-instant-ngp) ignore the orientation, so their cameras describe stored pixels. A camera.json describes what one sees:
-upright pixels.
+Every camera describes either the pixels that a picture file stores or those of the upright picture (EXIF orientation):
+see `CameraFrame.pixels`. COLMAP and the readers of transforms.json (nerfstudio,
+instant-ngp) ignore the orientation, so their cameras describe stored pixels. A camera.json describes upright
+pixels.
 """
 
 import math
@@ -43,7 +43,7 @@ from mistyle.io.sandbox.bounds import refuse
 SPACE = "working space: bounding sphere of radius 1 about the origin, right-handed, Y up"
 PIXELS: Pixels = "upright"  # that a camera.json describes
 MAX_SIDE = 16384
-# How far a stored rotation may be from a rotation: files with five digits pass.
+# Tolerance of stored rotations: files with five digits pass.
 RIGID = 1e-4
 ENDINGS = (".exr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
@@ -60,7 +60,7 @@ class _Pose(BaseModel):
 
 
 class ViewEntry(BaseModel):
-    """One view of a `camera.json`; what is unknown to us is passed over."""
+    """One view of a `camera.json`; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -85,7 +85,7 @@ class _CameraFile(BaseModel):
 
 
 class _Frame(BaseModel):
-    """A frame of a transforms.json; intrinsics stand in the frame or above all frames."""
+    """A frame of a transforms.json; intrinsics are in the frame or at the top level."""
 
     file_path: str = Field("", max_length=1000)
     mask_path: str | None = Field(None, max_length=1000)
@@ -98,8 +98,8 @@ class _Transforms(BaseModel):
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """One photograph of a model of cameras: its name (unique), its files as the model names them, its pose, its lens,
-    and which pixels of the files these two describe (the module's text)."""
+    """One photograph of a camera model: its name (unique), its files as the model names them, its pose and its lens.
+    `pixels` are the pixels of the files (stored or upright) that pose and lens describe."""
 
     name: str
     picture: str
@@ -110,7 +110,7 @@ class CameraFrame:
 
 
 def camera_entry(camera: Camera, depth: Float[np.ndarray, "h w"] | None = None) -> dict[str, Any]:
-    """The entry of one camera in `camera.json`; the depth range is of the finite depths."""
+    """The entry of one camera in `camera.json`; the depth range covers the finite depths."""
     seen = depth[np.isfinite(depth)] if depth is not None else np.zeros(0)
     near, far = (float(seen.min()), float(seen.max())) if seen.size else (None, None)
     opencv, opengl = camera.cam_from_world, OPENGL_FROM_OPENCV @ camera.cam_from_world
@@ -130,7 +130,7 @@ def camera_entry(camera: Camera, depth: Float[np.ndarray, "h w"] | None = None) 
 
 
 def transforms(cameras: Sequence[Camera], files: Sequence[str]) -> dict[str, Any]:
-    """The content of `transforms.json`; intrinsics also stand in each frame, as the views may differ."""
+    """The content of `transforms.json`; intrinsics are repeated in each frame, as the views may differ."""
     frames = [
         {
             "file_path": file,
@@ -150,17 +150,17 @@ def read_entries(path: Path) -> list[tuple[Camera, ViewEntry]]:
     except ValidationError as error:
         raise _unfit(path, error, "a camera.json as mistyle writes it") from error
     names = [entry.name for entry in entries]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise refuse(path, f"two views named '{twice}'", "a name for each view", "Rename one")
+    duplicate = next((name for name in names if names.count(name) > 1), None)
+    if duplicate is not None:
+        raise refuse(path, f"two views named '{duplicate}'", "a name for each view", "Rename one")
     return [(_camera(entry, path), entry) for entry in entries]
 
 
 def read_cameras(path: Path, size: tuple[int, int] = (1024, 1024)) -> list[Camera]:
-    """The cameras of a `camera.json` or `transforms.json` (told apart by what is in it), in working units.
+    """The cameras of a `camera.json` or `transforms.json` (distinguished by content), in working units.
 
-    `size` (height, width) is taken where a transforms.json does not say (w, h). Lens distortion, unequal focal
-    lengths and matrices that are no rigid motion are refused.
+    `size` (height, width) is the default for a transforms.json without (w, h). Lens distortion, unequal focal lengths
+    and matrices that are not rigid motions are refused.
     """
     tree = read_json(Path(path))
     if "frames" not in tree:
@@ -179,9 +179,9 @@ def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[C
     """The frames of a `transforms.json` with their lenses (k1 k2 k3 p1 p2), in the file's order and the space before
     nerfstudio's `applied_transform` and `applied_scale`.
 
-    `size_of` gives (height, width) of the picture that a frame names, where the file does not say (w, h). A frame's own
-    intrinsics go before those above all frames. Refused: fisheye and other camera models, matrices (3 x 4 or 4 x 4)
-    that are no rigid motion.
+    `size_of` returns (height, width) of the picture that a frame names, for files without (w, h). A frame's own
+    intrinsics override those at the top level. Refused: fisheye and other camera models, matrices (3 x 4 or 4 x 4) that
+    are not rigid motions.
     """
     tree = read_json(path)
     original = np.linalg.inv(_applied(tree, path))
@@ -197,12 +197,12 @@ def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[C
 
 
 def unique_names(files: Sequence[str]) -> list[str]:
-    """A name for each picture: its file's without folder and ending, or with the folders where two would be alike."""
+    """A name for each picture: its file's without folder and ending, or with the folders where two names are equal."""
     paths = [PurePosixPath(file.replace("\\", "/")) for file in files]
     short = [stem(path.name) for path in paths]
-    alike = {name for name, times in Counter(short).items() if times > 1}
+    repeated = {name for name, times in Counter(short).items() if times > 1}
     return [
-        stem("_".join(part for part in path.parts if part not in ("/", ".", ".."))) if name in alike else name
+        stem("_".join(part for part in path.parts if part not in ("/", ".", ".."))) if name in repeated else name
         for path, name in zip(paths, short, strict=True)
     ]
 
@@ -213,15 +213,15 @@ def stem(name: str) -> str:
 
 
 def _fields(tree: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
-    """A frame's fields, and those above all frames that it does not have itself. The focal lengths are one of them: a
-    field of view of the frame's own is not overruled by a focal length of the whole file."""
+    """A frame's fields, completed by those at the top level. The focal lengths are one group: a focal length at the top
+    level does not override a frame's own field of view."""
     kinds = ("fl_x", "fl_y", "camera_angle_x")
     own = any(frame.get(key) is not None for key in kinds)
     return {**{key: value for key, value in tree.items() if not (own and key in kinds)}, **frame}
 
 
 def _applied(tree: Mapping[str, Any], path: Path) -> Float[np.ndarray, "4 4"]:
-    """What nerfstudio did to the space of the reconstruction: a similarity, the identity where nothing is said."""
+    """nerfstudio's transform of the space of the reconstruction: a similarity, by default the identity."""
     matrix = tree.get("applied_transform")
     scale = tree.get("applied_scale", 1.0)
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not (0 < scale < math.inf):
@@ -290,8 +290,8 @@ def _frame(
     k1, k2, k3, p1, p2 = (float(number(key) or 0.0) for key in ("k1", "k2", "k3", "p1", "p2"))
     centre = (width / 2 if cx is None else float(cx), height / 2 if cy is None else float(cy))
     lens = Lens((float(fx), float(fy)), centre, (height, width), (k1, k2, k3), (p1, p2))
-    there = moved_camera(Camera(matrix, float(fx), centre, (height, width), name), original).world_from_cam
-    return CameraFrame(name, known.file_path, known.mask_path, there, lens, "stored")
+    world_from_cam = moved_camera(Camera(matrix, float(fx), centre, (height, width), name), original).world_from_cam
+    return CameraFrame(name, known.file_path, known.mask_path, world_from_cam, lens, "stored")
 
 
 def _camera(entry: ViewEntry, path: Path) -> Camera:

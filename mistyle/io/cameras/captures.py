@@ -1,16 +1,16 @@
-"""Photographs or renders with known cameras, as others keep them, read as the references of a fit.
+"""Reader of a fit's references: photographs or renders with known cameras.
 
 A folder with our `camera.json` (io/cameras/camera_files.py), a NeRF/Blender `transforms.json` with its pictures, or a
 COLMAP model with its `images`. EXR pictures are linear and, where they have an A channel, premultiplied by it; all
 others are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture becomes linear Rec.709 radiance seen by a
-pinhole camera with square pixels: encoded values go through the exact sRGB curve, a lens's distortion and unequal focal
-lengths are resampled away.
+pinhole camera with square pixels: encoded values go through the exact sRGB curve, lens distortion and unequal focal
+lengths are removed by resampling.
 
-A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py): the picture
-and the mask of a view are both read so, `CapturedPicture.pixels`.
+A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py):
+`CapturedPicture.pixels`, for both the picture and the mask of a view.
 
-Which pixels count: finite, not saturated (an encoded channel at its maximum), wholly inside the alpha (a pixel that the
-object covers in part shows the background too) and inside the user's mask.
+Valid pixels are finite, not saturated (an encoded channel at its maximum), wholly inside the alpha and inside the
+user's mask. A partly covered pixel shows the background too.
 
 The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops times as bright as the radiance),
 `{"factor": {picture: factor, ...}}`, or the names and stops alone.
@@ -46,7 +46,7 @@ from mistyle.io.cameras.picture_files import (
     named_mask,
     picture_folder,
 )
-from mistyle.io.cameras.views import standing_picture
+from mistyle.io.cameras.views import picture_of_view
 from mistyle.io.read import (
     read_colmap,
     read_colmap_points,
@@ -69,10 +69,10 @@ class CapturedPicture:
     """One picture on disk.
 
     camera       the pinhole camera that it is resampled to
-    lens         what it was taken with
-    pixels       which pixels of the picture and the mask these two describe (io/cameras/camera_files.py)
-    factor       what its radiance was multiplied by
-    alpha_of     an EXR whose A is the alpha of a picture that has none of its own
+    lens         the lens of the photograph
+    pixels       the pixels of picture and mask that these two describe (io/cameras/camera_files.py)
+    factor       the exposure factor of its radiance
+    alpha_of     an EXR whose A is the alpha of a picture without its own
     orientation  the EXIF orientations 1..8 of picture and mask (1: none)
     """
 
@@ -98,18 +98,18 @@ def read_captures(
 ) -> Captures:
     """The references of a fit, in the space of `camera_space`; headers are read now, pixels one picture at a time.
 
-    path        a folder or file as the module says
+    path        a folder or file as described above
     lights      a lights.json (core/light.py) for these views; None takes the one beside the cameras; "unknown" gives
                 every view an empty list
-    masks       a folder with a picture per view, by the view's name or its picture's: what is brighter than half counts
-    exposure    a file as the module says, or stops by view
-    pictures    the folder of the pictures, where they are elsewhere; of the folders that a camera file names before a
-                picture, those that are not there are left out
-    saturation  encoded value 0..1 from which a channel is taken as saturated (JPEGs often stop short of 1)
-    coverage    least alpha 0..1 of a pixel that counts; its colour is freed of the premultiplication
+    masks       a folder with a picture per view, by the view's name or its picture's: brighter than half is valid
+    exposure    a file as described above, or stops by view
+    pictures    the folder of the pictures, where it is elsewhere; missing folders of a camera file's picture names are
+                dropped
+    saturation  encoded value 0..1 at which a channel counts as saturated (JPEGs often stay below 1)
+    coverage    least alpha 0..1 of a valid pixel; its colour is unpremultiplied
 
     Refused: cameras without pictures, pictures or masks of another size than their camera, views without lights,
-    masks or exposures for some views only. What the pixels themselves say is `check_pixels`'s business.
+    masks or exposures for some views only. `check_pixels` checks the pixel values.
     """
     shots = read_shots(path, masks=masks, exposure=exposure, pictures=pictures)
     names = [shot.camera.name for shot in shots]
@@ -119,7 +119,7 @@ def read_captures(
     def load(k: int) -> Loaded:
         rgb, counts = load_shot(shots[k], saturation, coverage)
         for array in (rgb, counts):
-            array.setflags(write=False)  # shared with whoever asks next
+            array.setflags(write=False)  # shared with later callers
         return rgb, counts
 
     return Captures(tuple(shot.camera for shot in shots), rig, load)
@@ -147,7 +147,7 @@ def read_shots(
             return read_size(place(name), "stored")
 
         frames = read_colmap(file) if kind == "colmap" else read_frames(file, size)
-        # Masks that the user hands in take the place of those that frames name.
+        # The user's masks replace those that frames name.
         homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
         named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
         shots = [_shot(frame, place(frame.picture), mask) for frame, mask in zip(frames, named, strict=True)]
@@ -163,7 +163,7 @@ def read_shots(
 
 
 def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ...]:
-    """Sentences about how the pictures and cameras of `read_shots` were understood."""
+    """Sentences about the interpretation of the pictures and cameras of `read_shots`."""
     notes = []
     tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
     if any(tagged):
@@ -183,15 +183,16 @@ def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ..
         applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
         if applied:
             notes.append(
-                f"{' and '.join(applied)} of {file.name} were undone: the cameras stand in the space of the "
+                f"{' and '.join(applied)} of {file.name} were inverted: the cameras are in the space of the "
                 "reconstruction. A mesh in nerfstudio's own space needs --align."
             )
     return tuple(notes)
 
 
 def camera_space(path: Path) -> Literal["working", "own"]:
-    """Whether the cameras stand about the mesh in its bounding sphere of radius 1 (camera.json, and a transforms.json
-    of ours), or in a space of their maker's: the mesh's own units, or one that alignment must find."""
+    """ "working": the cameras are in the working space, around the mesh in its bounding sphere of radius 1
+    (camera.json, and a transforms.json of ours). "own": they are in the mesh's own units, or in a space that alignment
+    must find."""
     kind, file = _source(Path(path))
     ours = kind == "camera.json" or (kind == "transforms" and read_json(file).get("space") == SPACE)
     return "working" if ours else "own"
@@ -204,7 +205,7 @@ def sparse_points(path: Path) -> SparsePoints | None:
 
 
 def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 0.999) -> Loaded:
-    """Linear radiance as the shot's pinhole camera sees it, and which pixels count; 0 where one does not."""
+    """Linear radiance in the shot's pinhole camera, 0 at invalid pixels, and the mask of valid pixels."""
     rgb, alpha, usable = _decoded(shot, saturation)
     if alpha is not None:
         usable = usable & (alpha >= coverage)
@@ -217,15 +218,15 @@ def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 
 
 
 def silhouette(shot: CapturedPicture) -> Bool[np.ndarray, "h w"]:
-    """Where the object is, by the user's mask, else by the picture's alpha (at least half), in the pinhole camera.
+    """The object's mask in the pinhole camera, from the user's mask, else from the picture's alpha (at least half).
 
     Refused: a picture without either.
     """
-    found = outline_of(shot)
-    if found is None:
+    outline = outline_of(shot)
+    if outline is None:
         fix = "Hand in masks (a folder with a picture of the same name per view)"
         raise refuse(shot.picture, "neither an alpha channel nor a mask", "to know where the object is", fix)
-    return found
+    return outline
 
 
 def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
@@ -242,9 +243,9 @@ def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
 
 
 def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda done: None) -> tuple[str, ...]:
-    """Sentences about pictures that say nothing, each by name; decodes every picture once.
+    """Sentences about uninformative pictures, each by name; decodes every picture once.
 
-    InputRefused when no picture says anything: all are black, or no pixel of any of them counts.
+    InputRefused when all pictures are uninformative: black, or without a valid pixel.
     """
     notes: list[str] = []
     black = empty = 0
@@ -252,14 +253,14 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
         rgb, counts = captures.load(k)
         if not counts.any():
             empty += 1
-            notes.append(f"{camera.name}: no pixel counts; all are saturated, masked out or see no object.")
+            notes.append(f"{camera.name}: no valid pixel; all are saturated, masked out or miss the object.")
         elif not rgb[counts].any():
             black += 1
-            notes.append(f"{camera.name}: black wherever it counts.")
+            notes.append(f"{camera.name}: all valid pixels are black.")
         progress((k + 1) / len(captures))
     if len(captures) and black + empty == len(captures):
         raise InputRefused(
-            f"the references: found {black} pictures that are black and {empty} without a pixel that counts, of "
+            f"the references: found {black} pictures that are black and {empty} without a valid pixel, of "
             f"{len(captures)}; expected pictures of the object. Check exposure, masks and the light."
         )
     if len(captures) < 3:
@@ -268,15 +269,15 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
 
 
 def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap"], Path]:
-    """What kind of references `path` is, and the file (COLMAP: the model's folder) that holds the cameras."""
+    """The kind of references at `path`, and the file (COLMAP: the model's folder) with the cameras."""
     if path.is_dir():
-        named = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
+        camera_files = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
         model = find_model(path)
-        if not named and model is not None:
+        if not camera_files and model is not None:
             return "colmap", model
-        if not named:
+        if not camera_files:
             raise refuse(path, "neither of these in the folder", EXPECTED, "Hand in the folder with the cameras")
-        path = named[0]
+        path = camera_files[0]
     elif not path.is_file():
         raise refuse(path, "nothing", EXPECTED, "Check the path")
     if path.suffix.lower() != ".json":
@@ -289,7 +290,7 @@ def _home(path: Path) -> Path:
 
 
 def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -> CapturedPicture:
-    """A view of our camera.json: its EXR, or the picture that was edited or added (as io/cameras/views.py has it)."""
+    """A view of our camera.json: its EXR, or an edited or added picture (the rule of io/cameras/views.py)."""
     folder = file.parent
     if elsewhere is not None:
         folder = elsewhere
@@ -298,7 +299,7 @@ def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -
         }
         entry = entry.model_copy(update=files)
     exr = folder / f"{camera.name}.exr" if entry.exr is None else inside(folder, entry.exr, file, HAND_IN)
-    picture = standing_picture(folder, camera, entry, exr if exr.is_file() else None, HAND_IN)
+    picture = picture_of_view(folder, camera, entry, exr if exr.is_file() else None, HAND_IN)
     lens = Lens((camera.focal, camera.focal), camera.centre, camera.size)
     alpha_of = exr if picture is not None and exr.is_file() else None
     return CapturedPicture(camera, lens, picture or exr, PIXELS, alpha_of=alpha_of)
@@ -311,7 +312,7 @@ def _shot(frame: CameraFrame, picture: Path, mask: Path | None) -> CapturedPictu
 
 
 def _checked(picture: Path, shot: CapturedPicture) -> int:
-    """The EXIF orientation of a picture or mask that has the size of its view's camera; refused where it has not."""
+    """The EXIF orientation of a picture or mask; InputRefused where its size is not its camera's."""
     height, width, orientation = read_stored_size(picture)
     if shot.pixels == "upright" and orientation > 4:
         height, width = width, height
@@ -328,25 +329,25 @@ def _checked(picture: Path, shot: CapturedPicture) -> int:
 
 
 def _lights(home: Path, file: Path | None, names: list[str]) -> tuple[Lights, ...]:
-    found = Path(file) if file is not None else home / "lights.json"
-    if not found.is_file():
+    path = Path(file) if file is not None else home / "lights.json"
+    if not path.is_file():
         fix = (
             'Write one, such as {"lights": [{"type": "environment", "file": "studio.hdr"}]} or {"views": {"'
             f'{names[0]}": [{{"type": "directional", "direction": [0, 1, 0], "irradiance": [3, 3, 3]}}], ...}}}}'
         )
-        raise refuse(found, "no file", "the light of each picture", fix)
+        raise refuse(path, "no file", "the light of each picture", fix)
     maps: dict[str, np.ndarray] = {}
 
     def load(name: str) -> Float[np.ndarray, "h w 3"]:
         if name not in maps:
-            maps[name] = read_radiance(inside(found.parent, name, found, COPY))
+            maps[name] = read_radiance(inside(path.parent, name, path, COPY))
         return maps[name]
 
-    return lights_of_views(read_json(found), names, str(found), load)
+    return lights_of_views(read_json(path), names, str(path), load)
 
 
 def _factors(exposure: Path | Mapping[str, float] | None, names: list[str]) -> list[float]:
-    """What each picture's radiance was multiplied by."""
+    """The exposure factor of each picture's radiance."""
     if exposure is None:
         return [1.0] * len(names)
     where = exposure if isinstance(exposure, Path | str) else "exposure"
@@ -369,7 +370,7 @@ def _factors(exposure: Path | Mapping[str, float] | None, names: list[str]) -> l
 def _decoded(
     shot: CapturedPicture, saturation: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, Bool[np.ndarray, "h w"]]:
-    """Linear colours (still premultiplied in an EXR), alpha, and where they are finite and not saturated."""
+    """Linear colours (still premultiplied in an EXR), alpha, and the mask of finite, unsaturated pixels."""
     if shot.picture.suffix.lower() == ".exr":
         planes = read_exr(shot.picture)
         if not {"R", "G", "B"} <= set(planes):
@@ -383,7 +384,7 @@ def _decoded(
 
 
 def _alpha(shot: CapturedPicture, decoded: Picture | None = None) -> Float[np.ndarray, "h w"] | None:
-    """The alpha of the picture (`decoded`, where it is at hand), or of the EXR that it took the place of."""
+    """The alpha of the picture (`decoded`, if available), or of the EXR that it replaces."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")
     picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded

@@ -1,7 +1,7 @@
-"""COLMAP's sparse models, text and binary: cameras, images and points.
+"""Reader of COLMAP's sparse models, text and binary: cameras, images and points.
 
 COLMAP's conventions are ours: camera axes x right, y down, z forward; x_cam = R x + t; the first pixel's centre is
-(0.5, 0.5). Only what is needed is kept: the two-dimensional observations are passed over.
+(0.5, 0.5). The two-dimensional observations are skipped.
 """
 
 import re
@@ -33,7 +33,7 @@ AGAIN = "Export the model again (`colmap model_converter`)"
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """The points of a model: place (the model's units), mean reprojection error (pixels), number of observations."""
+    """The points of a model: position (the model's units), mean reprojection error (pixels), number of observations."""
 
     position: Float[np.ndarray, "n 3"]
     error: Float[np.ndarray, " n"]
@@ -54,7 +54,7 @@ def read_model(folder: Path) -> list[CameraFrame]:
     `CameraFrame.picture` is COLMAP's own name.
 
     Refused: camera models other than SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV, by their names;
-    damaged files; images of cameras that are not there; no images at all.
+    damaged files; images of missing cameras; no images at all.
     """
     path, binary = _file(folder, "cameras")
     lenses = _guarded(_cameras_bin if binary else _cameras_txt, path)
@@ -66,20 +66,20 @@ def read_model(folder: Path) -> list[CameraFrame]:
     for (pose, camera, picture), name in zip(rows, unique_names([row[2] for row in rows]), strict=True):
         if camera not in lenses:
             raise refuse(path, f"camera {camera} of the image {picture!r}", "one of cameras' numbers", AGAIN)
-        # COLMAP reads the pixels as they are stored, whatever EXIF says of the orientation.
+        # COLMAP reads the stored pixels and ignores the EXIF orientation.
         frames.append(CameraFrame(name, picture, None, _world_from_cam(pose, picture, path), lenses[camera], "stored"))
     return frames
 
 
 def read_points(folder: Path) -> SparsePoints | None:
     """The points of a model, or None where it has no points3D file."""
-    there = [path for ending in (".bin", ".txt") if (path := folder / f"points3D{ending}").is_file()]
-    if not there:
+    files = [path for ending in (".bin", ".txt") if (path := folder / f"points3D{ending}").is_file()]
+    if not files:
         return None
-    rows = _guarded(_points_bin if there[0].suffix == ".bin" else _points_txt, there[0])
+    rows = _guarded(_points_bin if files[0].suffix == ".bin" else _points_txt, files[0])
     table = np.asarray(rows, float).reshape(-1, 5)
     if not np.isfinite(table[:, :3]).all():
-        raise refuse(there[0], "points at NaN or infinity", "finite points", AGAIN)
+        raise refuse(files[0], "points at NaN or infinity", "finite points", AGAIN)
     return SparsePoints(table[:, :3], table[:, 3], table[:, 4].astype(np.int64))
 
 
@@ -89,14 +89,14 @@ def _file(folder: Path, name: str) -> tuple[Path, bool]:
 
 
 def _guarded(reader, path: Path):
-    """What `reader` gives; a file that ends too soon or holds other things than it should is refused."""
+    """The result of `reader`; truncated and invalid files are refused."""
     try:
         return reader(path)
     except InputRefused:
         raise
     except (struct.error, ValueError, IndexError, OverflowError, UnicodeDecodeError) as error:
-        found = f"a damaged or cut-off file ({str(error)[:100]})"
-        raise refuse(path, found, f"COLMAP's {path.name}", AGAIN) from error
+        problem = f"a damaged or cut-off file ({str(error)[:100]})"
+        raise refuse(path, problem, f"COLMAP's {path.name}", AGAIN) from error
 
 
 def _lens(model: str, width: int, height: int, values: list[float], path: Path) -> Lens:
@@ -121,7 +121,7 @@ def _world_from_cam(pose: tuple[float, ...], picture: str, path: Path) -> Float[
     quaternion, shift = np.asarray(pose[:4]), np.asarray(pose[4:])
     length = np.linalg.norm(quaternion)
     if not np.isfinite(pose).all() or length < 1e-6:
-        raise refuse(path, f"a pose that is none, of {picture!r}", "a quaternion and a translation", AGAIN)
+        raise refuse(path, f"an invalid pose of {picture!r}", "a quaternion and a translation", AGAIN)
     w, x, y, z = quaternion / length
     rotation = np.array(
         [
@@ -138,7 +138,7 @@ def _world_from_cam(pose: tuple[float, ...], picture: str, path: Path) -> Float[
 
 
 class _Bytes:
-    """A reading head on a file's bytes; it raises where the file ends too soon (state: where it stands)."""
+    """Reader of a file's bytes; it raises where the file ends too soon (state: the offset)."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.at = read_bytes(path), 0
@@ -192,7 +192,7 @@ def _points_bin(path: Path) -> list[tuple[float, ...]]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """The lines that are no comments, whatever ends them; a byte-order mark is passed over."""
+    """The lines that are not comments, with any line ending; a byte-order mark is skipped."""
     for line in re.split(r"\r\n|\r|\n", read_bytes(path).decode("utf-8-sig")):
         if not line.lstrip().startswith("#"):
             yield line
@@ -208,7 +208,7 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 
 def _images_txt(path: Path) -> list[tuple[tuple[float, ...], int, str]]:
-    """An image's line and the line of its observations, which is left out by some writers where there are none."""
+    """The images' lines. The line of observations after each may be absent: some writers omit empty ones."""
     rows = []
     after_image = False  # whether observations may come
     for line in _lines(path):
@@ -224,7 +224,7 @@ def _images_txt(path: Path) -> list[tuple[tuple[float, ...], int, str]]:
 
 
 def _is_observations(line: str) -> bool:
-    """Whether a line of images.txt holds triples of X, Y and POINT3D_ID, and so no image with its name."""
+    """Whether a line of images.txt holds triples of X, Y and POINT3D_ID, and so is not an image with its name."""
     fields = line.split()
     try:
         [float(v) for v in fields]

@@ -1,8 +1,8 @@
-"""Where the pictures and masks of cameras lie: names of camera files, as files on disk.
+"""Paths of the pictures and masks that camera files name.
 
-A name is taken letter by letter (a percent sign is a letter); backslashes separate folders; a picture's ending may be
-left out. Nothing outside the folder of the pictures is opened: a name that leads out of it is refused, unless the user
-hands in the folder that holds the picture.
+Names are literal (a percent sign is a letter); backslashes separate folders; a picture's ending may be omitted. Only
+files in the folder of the pictures are opened: a name that leads out of it is refused, unless the user hands in the
+picture's folder.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ ADD = "Add it, or take the view out of the camera file"
 
 
 def picture_folder(pictures: Path) -> Path:
-    """The folder that was handed in for the pictures, if it is one."""
+    """The user's folder of pictures; refused where it is not a folder."""
     if not pictures.is_dir():
         raise refuse(pictures, "no folder", "the folder of the pictures (--pictures)", "Check the path")
     return pictures
@@ -26,31 +26,31 @@ def picture_folder(pictures: Path) -> Path:
 def images_folder(path: Path, model: Path) -> Path:
     """The folder of a COLMAP model's pictures."""
     places = [p / "images" for p in (path, *path.resolve().parents[:2])]
-    found = next((place for place in places if place.is_dir()), None)
-    if found is None:
+    folder = next((place for place in places if place.is_dir()), None)
+    if folder is None:
         raise refuse(model, "no folder 'images' beside the model", "the pictures' folder", HAND_IN)
-    return found
+    return folder
 
 
 def find(folder: Path, name: str, file: Path) -> Path:
     """The picture that the camera file names, with or without its ending; in the folder or below."""
-    there = _there(inside(folder, name, file, HAND_IN))
-    if there is None:
+    picture = _existing(inside(folder, name, file, HAND_IN))
+    if picture is None:
         raise refuse(folder, f"no picture {name!r}", "one for every camera", f"{ADD}. {HAND_IN}")
-    return there
+    return picture
 
 
 def find_elsewhere(folder: Path, name: str) -> Path:
-    """The picture of that name in a folder that was handed in: as it is named, else without its first folders."""
+    """The picture of that name in the user's folder: by its full name, else without its first folders."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..")]
     for k in range(len(parts)):
-        there = _there(folder.joinpath(*parts[k:]))
-        if there is not None:
-            return inside(folder, "/".join([*parts[k:-1], there.name]), folder, COPY)
+        picture = _existing(folder.joinpath(*parts[k:]))
+        if picture is not None:
+            return inside(folder, "/".join([*parts[k:-1], picture.name]), folder, COPY)
     raise refuse(folder, f"no picture {name!r}", "one for every camera", ADD)
 
 
-def _there(exact: Path) -> Path | None:
+def _existing(exact: Path) -> Path | None:
     """The file, or the one with a picture's ending after its name."""
     return exact if exact.is_file() else next(iter(_with_endings(exact.parent, [exact.name])), None)
 
@@ -58,19 +58,19 @@ def _there(exact: Path) -> Path | None:
 def named_mask(places: Sequence[Path], name: str, file: Path) -> Path:
     """The mask that a frame names, in the first of these folders that has it."""
     fix = "Hand in the masks with --masks DIR"
-    there = [found for place in places if (found := _there(inside(place, name, file, fix))) is not None]
-    if not there:
+    masks = [mask for place in places if (mask := _existing(inside(place, name, file, fix))) is not None]
+    if not masks:
         raise refuse(file, f"no mask {name!r}", "the mask that its frame names", fix)
-    return there[0]
+    return masks[0]
 
 
 def check_different(pictures: Mapping[str, Path], folder: Path) -> None:
-    """Refuse one picture for two views: names that lost their folders may have become one."""
+    """Refuse one picture for two views: names without their folders may coincide."""
     first: dict[Path, str] = {}
     for view, picture in pictures.items():
-        other = first.setdefault(picture.resolve(), view)
-        if other != view:
-            found = f"{picture.name} alone for the views '{other}' and '{view}'"
+        first_view = first.setdefault(picture.resolve(), view)
+        if first_view != view:
+            found = f"{picture.name} alone for the views '{first_view}' and '{view}'"
             raise refuse(folder, found, "a picture for every view", "Keep the folders that the camera file names")
 
 
@@ -80,10 +80,10 @@ def _with_endings(folder: Path, names: Iterable[str]) -> list[Path]:
 
 
 def mask_of_view(folder: Path, view: str, picture: Path) -> Path:
-    """The mask in the user's folder of masks that has the name of the view or of its picture."""
+    """The mask with the name of the view or of its picture, in the user's folder of masks."""
     names = [view, picture.name, stem(picture.name)]
-    there = _with_endings(folder, names) or _with_endings(folder / picture.parent.name, names)
-    if not there:
-        found = f"no mask for the view '{view}'"
-        raise refuse(folder, found, f"{view}.png or {picture.name}.png", "Add it; white where the picture counts")
-    return there[0]
+    masks = _with_endings(folder, names) or _with_endings(folder / picture.parent.name, names)
+    if not masks:
+        problem = f"no mask for the view '{view}'"
+        raise refuse(folder, problem, f"{view}.png or {picture.name}.png", "Add it; white where the picture counts")
+    return masks[0]

@@ -1,6 +1,6 @@
-"""A folder of views: what we write for others and read back, from us or from anyone who edited or made the pictures.
+"""Folders of views: writer, and reader of our own, edited and foreign folders.
 
-`<name>.exr` holds the truth, float32, linear Rec.709, row 0 at the top:
+`<name>.exr` holds the reference data, float32, linear Rec.709, row 0 at the top:
 
     R G B               linear, premultiplied by A
     A                   coverage, 0..1
@@ -9,7 +9,7 @@
     uv.U uv.V           v up
     part.index          texture set, -1 off the mesh
 
-`<name>.png` is the same picture for eyes and painters: sRGB, 8 bit, straight alpha (the coverage). `camera.json` and
+`<name>.png` is the same picture for viewing and painting: sRGB, 8 bit, straight alpha (the coverage). `camera.json` and
 `transforms.json` hold the cameras (io/cameras/camera_files.py), `lights.json` the lights (core/light.py). With
 `paper_files` also `<name>_depth.png` (foreground-normalised, near white, background black) and `<name>_canny.png`
 (thresholds 100/200).
@@ -101,7 +101,7 @@ def channels(view: View) -> dict[str, np.ndarray]:
 
 
 def straight_srgb(view: View) -> Float[np.ndarray, "h w 4"]:
-    """sRGB-encoded colour, no longer premultiplied, and coverage: what a painting program expects."""
+    """sRGB-encoded straight colour and coverage, for painting programs."""
     colour = view.rgb / np.maximum(view.coverage, 1e-6)[..., None]
     return np.concatenate([srgb_from_linear(colour), view.coverage[..., None]], axis=-1).astype(np.float32)
 
@@ -109,7 +109,7 @@ def straight_srgb(view: View) -> Float[np.ndarray, "h w 4"]:
 def paper_depth(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Paper 4.1.1: depth over the foreground's range, nearest 1, farthest 0, background 0; constant depth gives 1.
 
-    In 8 bits it is good for conditioning a network only: its steps move points by pixels between views.
+    In 8 bits it suits only the conditioning of a network: its steps move points by pixels between views.
     """
     seen = np.isfinite(depth)
     if not seen.any():
@@ -122,19 +122,19 @@ def paper_depth(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 def read_lights(path: Path) -> Lights:
     """A `lights.json`, or the one in a folder of views."""
     path = Path(path)
-    found = path / "lights.json" if path.is_dir() else path
-    return from_json(read_json(found), str(found), lambda name: read_radiance(inside(found.parent, name, found, COPY)))
+    file = path / "lights.json" if path.is_dir() else path
+    return from_json(read_json(file), str(file), lambda name: read_radiance(inside(file.parent, name, file, COPY)))
 
 
 def read_views(folder: Path) -> list[View]:
     """The views of a folder with a `camera.json` (or `transforms.json`) and a picture per view, in the file's order.
 
-    A view's colours are taken from `<name>.exr`, unless `<name>.png` (or .jpg, .webp, .tif) was edited or added since
-    we wrote the folder (the PNG's sha256 stands in camera.json): then the edited picture wins. A folder that others
-    made needs one picture per view. Alpha is the mask. Where an EXR has the geometry layers, depth, normal, uv and
-    part are read; else depth is infinite, normal and uv are zero and part is -1 (to be traced from the mesh), and the
-    mask is the alpha's (everything where there is none). A picture of another size but the same aspect ratio moves
-    the camera to that size; the EXR's geometry is then not used.
+    A view's colours come from `<name>.exr`. A `<name>.png` (or .jpg, .webp, .tif) that was edited or added since we
+    wrote the folder (camera.json has the PNG's sha256) takes precedence. A foreign folder needs one picture per view.
+    Alpha is the mask. Where an EXR has the geometry layers, depth, normal, uv and part are read. Else they must be
+    traced from the mesh: depth is infinite, normal and uv are zero, part is -1, and the mask is the alpha's (full
+    without one). A picture of another size but the same aspect ratio moves the camera to that size; the EXR's geometry
+    is then not used.
     """
     folder = Path(folder)
     cameras = _entries(folder)
@@ -162,39 +162,37 @@ def _read_view(folder: Path, camera: Camera, entry: ViewEntry | None) -> View:
     planes = read_exr(exr) if exr.is_file() else {}
     if planes and not {"R", "G", "B"} <= set(planes):
         raise refuse(exr, f"channels {', '.join(sorted(planes))[:200]}", "R, G and B", "Write the colours as R, G, B")
-    picture = standing_picture(folder, camera, entry, exr if planes else None)
+    picture = picture_of_view(folder, camera, entry, exr if planes else None)
     if picture is None:
         return _view(camera, _stack(planes, "R", "G", "B"), planes.get("A"), planes, exr)
     # Without an entry the camera is of a transforms.json, which describes stored pixels (io/cameras/camera_files.py).
-    found = read_picture(picture, PIXELS if entry is not None else "stored")
-    linear = linear_from_srgb(found.rgb)
-    shape = found.rgb.shape[:2]
+    decoded = read_picture(picture, PIXELS if entry is not None else "stored")
+    linear = linear_from_srgb(decoded.rgb)
+    shape = decoded.rgb.shape[:2]
     if shape != camera.size:
         planes = {}
-    alpha = found.alpha if found.alpha is not None else planes.get("A")
+    alpha = decoded.alpha if decoded.alpha is not None else planes.get("A")
     return _view(camera, linear if alpha is None else linear * alpha[..., None], alpha, planes, picture)
 
 
-def standing_picture(
+def picture_of_view(
     folder: Path, camera: Camera, entry: ViewEntry | None, exr: Path | None, fix: str = COPY
 ) -> Path | None:
-    """The picture that stands for the view instead of its EXR, or None when the EXR does. `fix` is what helps where the
-    entry names a picture outside the folder."""
-    there = [path for ending in PICTURES if (path := folder / f"{camera.name}{ending}").is_file()]
+    """The picture that replaces the view's EXR, or None. `fix` is the advice where the entry names a picture outside
+    the folder."""
+    existing = [path for ending in PICTURES if (path := folder / f"{camera.name}{ending}").is_file()]
     if entry is not None and entry.png is not None:
         named = inside(folder, entry.png, folder / "camera.json", fix)
-        if named.is_file() and named not in [path.resolve() for path in there]:
-            there.append(named)
+        if named.is_file() and named not in [path.resolve() for path in existing]:
+            existing.append(named)
     written = entry.png_sha256 if entry is not None else None
-    edited = [path for path in there if path.suffix != ".png" or sha256_file(path) != written]
+    edited = [path for path in existing if path.suffix != ".png" or sha256_file(path) != written]
     if exr is not None and written is None:
         return None
-    candidates = edited or ([] if exr is not None else there)
+    candidates = edited or ([] if exr is not None else existing)
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
-        raise refuse(
-            folder, f"{names} for the view '{camera.name}'", "one picture per view", "Keep the one that counts"
-        )
+        raise refuse(folder, f"{names} for the view '{camera.name}'", "one picture per view", "Keep one of them")
     if not candidates and exr is None:
         found = f"no picture for the view '{camera.name}'"
         raise refuse(folder, found, f"{camera.name}.exr, .png or .jpg", "Add it, or take the view out of camera.json")

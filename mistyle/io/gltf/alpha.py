@@ -1,4 +1,4 @@
-"""The opacity of a user's cut-out and blended glTF materials, which a new base colour has to carry on."""
+"""Opacity of a user's cut-out and blended glTF materials, which a new base colour must preserve."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +18,8 @@ from mistyle.io.sandbox.bounds import beside, read_bytes
 
 @dataclass(frozen=True)
 class Cutout:
-    """A base colour's alpha (row 0 is v = 1, outside the square as `wrap` says), where every corner of the mesh lies in
-    it (v up; zero for faces of other parts), and every corner's own alpha (1 there)."""
+    """A base colour's alpha (row 0 is v = 1, `wrap` outside the square), the UVs of every corner of the mesh in it (v
+    up; zero for faces of other parts), and every corner's own alpha (1 for those faces)."""
 
     alpha: Float[np.ndarray, "h w"]
     uvs: Float[np.ndarray, "f 3 2"]
@@ -28,9 +28,9 @@ class Cutout:
 
 
 def cutouts(asset: Asset) -> dict[int, Cutout]:
-    """For every part whose material is cut out or blended (alphaMode) by its texture or vertex colours: their alpha.
+    """The alpha of every part whose material is cut out or blended (alphaMode) by its texture or vertex colours.
 
-    Opaque materials ignore their alpha, and so do we. Alpha factors are not in it: they stay in the file.
+    The alpha of opaque materials is ignored, as in glTF. Alpha factors are excluded: they stay in the file.
     """
     path = asset.source.path
     tree, buffers = load_gltf(path)
@@ -43,10 +43,10 @@ def cutouts(asset: Asset) -> dict[int, Cutout]:
         faces = asset.mesh.faces[entry.start : entry.stop] - entry.first_vertex
         corners = _corner_alpha(tree, buffers, primitive, faces)
         info = _base_texture(tree, material)
-        found = None if info is None else _texture_alpha(tree, buffers, path, primitive, info, faces)
-        if found is None and (corners == 1).all():
+        texture = None if info is None else _texture_alpha(tree, buffers, path, primitive, info, faces)
+        if texture is None and (corners == 1).all():
             continue
-        alpha, uvs = found or (np.ones((1, 1), np.float32), np.zeros((*faces.shape, 2)))
+        alpha, uvs = texture or (np.ones((1, 1), np.float32), np.zeros((*faces.shape, 2)))
         for part in np.unique(asset.mesh.part[entry.start : entry.stop]).tolist():
             count = len(asset.mesh.faces)
             wrap = REPEAT if info is None else wrap_of(tree, info["index"])
@@ -67,7 +67,7 @@ def _corner_alpha(tree: Tree, buffers: Buffers, primitive: Tree, faces: np.ndarr
 def _texture_alpha(
     tree: Tree, buffers: Buffers, path: Path, primitive: Tree, info: Tree, faces: np.ndarray
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "f 3 2"]] | None:
-    """The alpha of a texture and where the corners of the faces lie in it; None where it is opaque or not there."""
+    """The alpha of a texture and the UVs of the faces' corners; None where it is opaque or missing."""
     texcoord = primitive["attributes"].get(f"TEXCOORD_{set_of(info)}")
     image = image_of(tree, info["index"])
     alpha = read_gltf_alpha(path, image) if texcoord is not None and image is not None else None
@@ -86,7 +86,7 @@ def _base_texture(tree: Tree, material: int) -> Tree | None:
 
 
 def image_bytes(image: Tree, tree: Tree, buffers: Buffers, path) -> bytes | None:
-    """The file of an image, from a buffer view, a data URI or beside `path`; None where it is missing or out of
+    """An image file's bytes, from a buffer view, a data URI or beside `path`; None where it is missing or out of
     bounds."""
     if "bufferView" in image:
         view = tree["bufferViews"][image["bufferView"]]

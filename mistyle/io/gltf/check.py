@@ -1,4 +1,4 @@
-"""The border for glTF: container, JSON, references and sizes are checked before anything is computed from them."""
+"""Validation of untrusted glTF: container, JSON, references and sizes are checked before use."""
 
 import base64
 import binascii
@@ -22,7 +22,7 @@ DECOMPRESS = (
     "Write it without compression: open it in Blender and export glTF with Compression off, or export an "
     "uncompressed file from the program that made it"
 )
-# What may be required: these change neither the vertices nor how they are found, or are handled by the reader.
+# Extensions that may be required: they do not change the vertices or their storage, or the reader handles them.
 READABLE = {
     *("KHR_texture_transform", "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_lights_punctual"),
     *("KHR_materials_variants", "KHR_materials_clearcoat", "KHR_materials_sheen", "KHR_materials_specular"),
@@ -79,12 +79,14 @@ def _check_depth(tree: Any, path: Path) -> None:
 
 
 def load_gltf(path: Path, say: Callable[[str], None] = lambda note: None) -> tuple[dict[str, Any], Buffers]:
-    """The JSON and the buffers of a .glb or .gltf file, checked: types and ranges of everything that is used later,
-    indices, buffer lengths against what accessors and views reach, the node graph (a forest), required extensions.
+    """The JSON and the buffers of a .glb or .gltf file, checked.
 
-    Buffers come from the file, from data URIs or from files in the folder of `path` or below; nothing is fetched.
-    Compressed copies of data that are there plainly are left out of the JSON. `say` hears of them, and of what others
-    may refuse. Raises InputRefused with the reason.
+    Checks: types and ranges of the fields in use; indices; buffer lengths against the extent of accessors and views;
+    the node graph (a forest); required extensions.
+
+    Buffers come from the file, from data URIs or from files in the folder of `path` or below; no network is used.
+    Compressed copies of uncompressed data are removed from the JSON. `say` receives notes on them, and on properties
+    that other readers may refuse. Raises InputRefused with the reason.
     """
     path = Path(path)
     binary = None
@@ -123,7 +125,7 @@ def load_gltf(path: Path, say: Callable[[str], None] = lambda note: None) -> tup
 
 
 def _is_plain(tree: dict[str, Any], d: Document) -> bool:
-    """Whether everything that is compressed is there plainly as well."""
+    """Whether all compressed data exist uncompressed as well."""
     for mesh in d.meshes:
         for primitive in mesh.primitives:
             if COMPRESSED & set(primitive.extensions):
@@ -131,15 +133,15 @@ def _is_plain(tree: dict[str, Any], d: Document) -> bool:
                 known = [d.accessors[i] for i in used if 0 <= i < len(d.accessors)]
                 if any(a.bufferView is None and a.sparse is None for a in known):
                     return False
-    # The place of what a view's compressed bytes decode to is a buffer of its own, which need not be in the file.
+    # A compressed view decodes into a buffer of its own, which may be absent from the file.
     views = [v for v in tree.get("bufferViews", []) if COMPRESSED & set(_extensions(v))]
     buffers = [d.buffers[v["buffer"]] for v in views if v["buffer"] < len(d.buffers)]
     return all(b.uri is not None or b is d.buffers[0] for b in buffers)
 
 
 def _extensions(item: dict[str, Any]) -> dict[str, Any]:
-    found = item.get("extensions")
-    return found if isinstance(found, dict) else {}
+    extensions = item.get("extensions")
+    return extensions if isinstance(extensions, dict) else {}
 
 
 def _forget_compression(tree: dict[str, Any]) -> None:
@@ -164,7 +166,7 @@ def _validated(tree: dict[str, Any], path: Path) -> Document:
 
 
 def _unpack(path: Path, say: Callable[[str], None]) -> tuple[dict[str, Any], memoryview | None]:
-    """JSON and binary chunk of a .glb (glTF 2.0, chapter 4), each read to where it stays."""
+    """JSON and binary chunk of a .glb (glTF 2.0, chapter 4), each read into its own memory."""
     size, head = path.stat().st_size, read_part(path, 0, 12)
     if size < 20:
         raise refuse(
@@ -226,12 +228,12 @@ def data_uri(uri: str, path: Path) -> bytes:
 
 
 def _check_indices(d: Document, path: Path) -> None:
-    """Every index points at something."""
+    """Refuse indices out of range."""
 
-    def check(what: str, index: int | None, items: list[Any]) -> None:
+    def check(label: str, index: int | None, items: list[Any]) -> None:
         if index is not None and not 0 <= index < len(items):
             raise refuse(
-                path, f"{what} {index}", f"0 to {len(items) - 1}" if items else "none, for there are none", AGAIN
+                path, f"{label} {index}", f"0 to {len(items) - 1}" if items else "none, since the list is empty", AGAIN
             )
 
     for view in d.bufferViews:
@@ -297,7 +299,7 @@ def _check_nodes(d: Document, path: Path) -> None:
         raise refuse(path, "a cycle in the node graph", "a tree of nodes", AGAIN)
     for scene in d.scenes:
         if any(not 0 <= i < len(d.nodes) for i in scene.nodes):
-            raise refuse(path, "a scene with a node that is not there", f"0 to {len(d.nodes) - 1}", AGAIN)
+            raise refuse(path, "a scene with a missing node", f"0 to {len(d.nodes) - 1}", AGAIN)
 
 
 _BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
@@ -343,5 +345,5 @@ def _check_sparse(d: Document, buffers: Buffers, path: Path) -> None:
         start = view.byteOffset + places.byteOffset
         index = np.frombuffer(buffers[view.buffer], kind, accessor.sparse.count, start)
         if index.max() >= accessor.count:
-            found = f"accessor {i} with a sparse value for element {index.max()}"
-            raise refuse(path, found, f"0 to {accessor.count - 1}", AGAIN)
+            problem = f"accessor {i} with a sparse value for element {index.max()}"
+            raise refuse(path, problem, f"0 to {accessor.count - 1}", AGAIN)

@@ -1,7 +1,7 @@
-"""The container: reading and adding accessors and images, and packing one self-contained .glb (glTF 2.0, chapter 4).
+"""The glTF container: reading and adding accessors and images, and packing one .glb (glTF 2.0, chapter 4).
 
-A tree is glTF's JSON as dicts and lists. A `Builder` holds a tree and the bytes of its buffer views; what is added
-goes to new buffer views, what was there keeps its bytes.
+A tree is glTF's JSON as dicts and lists. A `Builder` holds a tree and the bytes of its buffer views. Additions go to
+new buffer views; old ones keep their bytes.
 """
 
 import json
@@ -85,7 +85,7 @@ def _elements(
 
 
 def unit_normals(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Normals as glTF demands them: unit ones stay bit-equal, others are made unit, those of no length point up."""
+    """Unit normals for glTF: unit ones stay bit-equal, others are normalised, zero ones point up."""
     normals = normals.astype(np.float32)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     fixed = np.where(length > 1e-12, normals / np.maximum(length, 1e-12), np.array([0, 1, 0], np.float32))
@@ -93,10 +93,10 @@ def unit_normals(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 class Builder:
-    """A growing glTF: the tree and, for every buffer view, its bytes."""
+    """A glTF under construction: the tree, and the bytes of every buffer view."""
 
     def __init__(self, tree: Tree, buffers: Buffers) -> None:
-        """Take over a tree (it is changed from now on) and the content of its buffers."""
+        """Take over a tree, which the builder modifies, and the content of its buffers."""
         self.tree = tree
         self.blobs: list[bytes | memoryview] = []
         for view in tree.get("bufferViews", []):
@@ -104,7 +104,7 @@ class Builder:
             self.blobs.append(buffers[view["buffer"]][start : start + view["byteLength"]])
 
     def put(self, key: str, item: Tree) -> int:
-        """Append to one of the tree's lists; the index."""
+        """Append to one of the tree's lists; returns the index."""
         items = self.tree.setdefault(key, [])
         items.append(item)
         return len(items) - 1
@@ -124,20 +124,20 @@ class Builder:
             "type": f"VEC{array.shape[1]}",
         }
         if bounds:
-            # float32 to float and its shortest decimal form: exactly the stored value again.
+            # float32 to float and its shortest decimal form: exactly the stored value.
             item["min"], item["max"] = array.min(axis=0).tolist(), array.max(axis=0).tolist()
         return self.put("accessors", item)
 
     def raw_attribute(self, elements: np.ndarray, like: Tree) -> int:
-        """A new accessor for a vertex attribute whose elements (n, bytes) are of the type of another accessor."""
+        """A new accessor for a vertex attribute whose elements (n, bytes) have the type of the accessor `like`."""
         count, size = elements.shape
         padded = -(-size // 4) * 4
         data = np.zeros((count, padded), np.uint8)
         data[:, :size] = elements
         stride = {} if padded == size else {"byteStride": padded}
         view = self.view(data.tobytes(), **stride, target=ARRAY_BUFFER)
-        kept = {k: v for k, v in like.items() if k not in ("bufferView", "byteOffset", "count", "sparse")}
-        return self.put("accessors", {"bufferView": view, "count": count, **kept})
+        type_entries = {k: v for k, v in like.items() if k not in ("bufferView", "byteOffset", "count", "sparse")}
+        return self.put("accessors", {"bufferView": view, "count": count, **type_entries})
 
     def indices(self, faces: np.ndarray) -> int:
         """A new accessor of vertex numbers, two bytes each where they fit."""
@@ -153,14 +153,14 @@ class Builder:
         return self.put("images", {"name": name, "mimeType": "image/png", "bufferView": self.view(data)})
 
     def sampler(self, *, repeat: bool) -> int:
-        """A sampler with mipmaps; one of the same kind is used again."""
+        """A sampler with mipmaps; an equal one is reused."""
         wrap = REPEAT if repeat else CLAMP_TO_EDGE
         item = {"magFilter": LINEAR, "minFilter": LINEAR_MIPMAP_LINEAR, "wrapS": wrap, "wrapT": wrap}
-        found = self.tree.get("samplers", [])
-        return found.index(item) if item in found else self.put("samplers", item)
+        samplers = self.tree.get("samplers", [])
+        return samplers.index(item) if item in samplers else self.put("samplers", item)
 
     def pack(self) -> bytes:
-        """The whole as one .glb: every buffer view at a multiple of four bytes, in order, then nothing else."""
+        """The glTF as one .glb: every buffer view at a multiple of four bytes, in order."""
         offset, chunks = 0, []
         for view, blob in zip(self.tree.get("bufferViews", []), self.blobs, strict=True):
             view |= {"buffer": 0, "byteOffset": offset, "byteLength": len(blob)}

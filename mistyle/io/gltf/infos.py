@@ -1,4 +1,4 @@
-"""What the materials in a glTF's checked JSON say: textures, their lookups, emission. Nothing is decoded here."""
+"""Material queries on a glTF's checked JSON: textures, their lookups, emission. Nothing is decoded here."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ FLIP_V = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # (u, v) -> (u, 1 - v):
 
 
 def texture_infos(tree: Tree, material: int | None) -> dict[str, Tree]:
-    """The texture references of a material that reading uses: albedo, orm, normal, emission, specular (the colour of
+    """The texture references of a material that the reader uses: albedo, orm, normal, emission, specular (the colour of
     F0), gloss (the same and, in its alpha, glossiness)."""
     if material is None or material < 0:
         return {}
@@ -24,7 +24,7 @@ def texture_infos(tree: Tree, material: int | None) -> dict[str, Tree]:
     specular = entry.get("extensions", {}).get("KHR_materials_specular", {})
     specular = specular if isinstance(specular, dict) else {}
     base = pbr.get("baseColorTexture") if not glossy else glossy.get("diffuseTexture")
-    found = {
+    infos = {
         "albedo": entry.get("emissiveTexture") if shadeless(entry) else base,
         "orm": None if glossy else pbr.get("metallicRoughnessTexture"),
         "normal": entry.get("normalTexture"),
@@ -32,7 +32,7 @@ def texture_infos(tree: Tree, material: int | None) -> dict[str, Tree]:
         "specular": None if glossy else specular.get("specularColorTexture"),
         "gloss": glossy.get("specularGlossinessTexture"),
     }
-    return {name: info for name, info in found.items() if isinstance(info, dict) and "index" in info}
+    return {name: info for name, info in infos.items() if isinstance(info, dict) and "index" in info}
 
 
 def emits(entry: Tree) -> bool:
@@ -40,7 +40,7 @@ def emits(entry: Tree) -> bool:
 
 
 def shadeless(entry: Tree) -> bool:
-    """Whether a material shows its emission alone: a black base colour is how files say so without an extension."""
+    """Whether a material shows only its emission: files without an extension encode this by a black base colour."""
     glossy = "KHR_materials_pbrSpecularGlossiness" in entry.get("extensions", {})
     base = entry.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1, 1, 1, 1])
     return emits(entry) and not glossy and not any(c > 0 for c in base[:3])
@@ -66,28 +66,28 @@ def sees_through(tree: Tree, material: int) -> bool:
 
 
 def has_tangents(tree: Tree, material: int) -> bool:
-    """Whether the file gives the frames of the material's normal map itself."""
+    """Whether the file has the tangents of the material's normal map."""
     primitives = [p for mesh in tree.get("meshes", []) for p in mesh["primitives"] if p.get("material") == material]
     return all("TANGENT" in p["attributes"] for p in primitives)
 
 
 def image_of(tree: Tree, texture: int) -> int | None:
-    """The number of a texture's image; None where there is none that can be read."""
+    """The index of a texture's image; None without a readable one."""
     entry, images = tree["textures"][texture], tree.get("images", [])
     named = [entry.get("extensions", {}).get(name) for name in ("EXT_texture_webp", "EXT_texture_avif")]
-    sources = [one.get("source") for one in named if isinstance(one, dict)] + [entry.get("source")]
+    sources = [option.get("source") for option in named if isinstance(option, dict)] + [entry.get("source")]
     return next((s for s in sources if isinstance(s, int) and 0 <= s < len(images)), None)
 
 
 def wrap_of(tree: Tree, texture: int) -> Wraps:
-    """The wrap modes of a texture's sampler along u and v; it repeats where nothing is said."""
+    """The wrap modes of a texture's sampler along u and v; by default it repeats."""
     number, samplers = tree["textures"][texture].get("sampler"), tree.get("samplers", [])
     sampler = samplers[number] if number is not None else {}
     return WRAPS.get(sampler.get("wrapS"), "repeat"), WRAPS.get(sampler.get("wrapT"), "repeat")
 
 
 def nearest(tree: Tree, texture: int) -> bool:
-    """Whether a texture's sampler shows single texels where it is enlarged."""
+    """Whether a texture's sampler magnifies without interpolation."""
     number, samplers = tree["textures"][texture].get("sampler"), tree.get("samplers", [])
     return number is not None and samplers[number].get("magFilter") == 9728
 

@@ -1,4 +1,4 @@
-"""Materials of glTF: factors, and textures decoded when they are asked for."""
+"""Reader of glTF materials: factors, and textures decoded on demand."""
 
 from functools import partial
 from pathlib import Path
@@ -33,16 +33,16 @@ _DRAWN = ("KHR_materials_ior", "KHR_materials_specular", "KHR_materials_clearcoa
 
 
 def read_material(
-    tree: Tree, buffers: Buffers, path: Path, index: int, other: dict[int, np.ndarray], budget: Budget
+    tree: Tree, buffers: Buffers, path: Path, index: int, other_uvs: dict[int, np.ndarray], budget: Budget
 ) -> RawMaterial:
     if index < 0:
         return RawMaterial("material", no_textures, roughness_factor=0.5, shading=Shading(stated="nothing"))
     entry = tree["materials"][index]
-    said = entry.get("extensions", {})
-    # glTF's default is rough metal, which a file that says nothing about its surface hardly means.
+    extensions = entry.get("extensions", {})
+    # glTF's default is rough metal, which a file without surface parameters hardly intends.
     pbr = entry.get("pbrMetallicRoughness", {"metallicFactor": 0.0, "roughnessFactor": 0.5})
-    if GLOSSY in said:
-        glossy = extension(said, GLOSSY)
+    if GLOSSY in extensions:
+        glossy = extension(extensions, GLOSSY)
         gloss = number(glossy, "glossinessFactor", 1.0, 0.0, 1.0)
         pbr = {
             "baseColorFactor": triple(glossy, "diffuseFactor", (1.0, 1.0, 1.0), 1.0),
@@ -53,7 +53,7 @@ def read_material(
     rough, metal = pbr.get("roughnessFactor", 1.0), pbr.get("metallicFactor", 1.0)
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         metal = 0.0
-    load = partial(_load, tree, buffers, path, index, other, budget)
+    load = partial(_load, tree, buffers, path, index, other_uvs, budget)
     red, green, blue = (float(np.clip(c, 0, 1)) for c in colour[:3])
     return RawMaterial(
         entry.get("name") or f"material_{index}",
@@ -67,7 +67,7 @@ def read_material(
 
 
 def _load(
-    tree: Tree, buffers: Buffers, path: Path, index: int, other: dict[int, np.ndarray], budget: Budget, tile: int
+    tree: Tree, buffers: Buffers, path: Path, index: int, other_uvs: dict[int, np.ndarray], budget: Budget, tile: int
 ) -> tuple[Maps, tuple[str, ...]]:
     """The material's textures. glTF has no tiles."""
     maps: dict[str, RawMap] = {}
@@ -85,7 +85,7 @@ def _load(
             )
         chosen = set_of(info)
         lookup: Tree = dict(
-            uvs=other.get(chosen) if chosen != base else None,
+            uvs=other_uvs.get(chosen) if chosen != base else None,
             transform=texture_transform(info),
             wrap=wrap_of(tree, info["index"]),
         )
@@ -103,7 +103,7 @@ def _load(
             gloss = np.float32(number(glossy, "glossinessFactor", 1.0, 0.0, 1.0))
             maps["roughness"] = RawMap(1 - alpha_map(data, where) * gloss, **lookup, kind="data")
         elif name == "normal":
-            # Without TANGENT the frames follow the place of the lookup (as three.js and Khronos' viewer have it).
+            # Without TANGENT the frames follow the lookup coordinates (as in three.js and Khronos' viewer).
             frame: Tree = dict(scale=float(info.get("scale", 1.0)))
             frame |= dict(tangents="authored" if has_tangents(tree, index) else "looked up")
             maps["normal"] = RawMap(pixels, **lookup, kind="normal", **frame)
@@ -118,18 +118,18 @@ def _name(tree: Tree, index: int) -> str:
 
 
 def _unseen(tree: Tree, index: int) -> list[str]:
-    """What the material says that renders here do not show as it says it."""
+    """Notes on the material's properties that renders here show differently."""
     entry = tree["materials"][index]
     name, notes = _name(tree, index), []
     if shadeless(entry):
         notes.append(
-            f"Material '{name}' is black and shows its emission alone: that was taken as its albedo, and finished "
-            "assets have it so."
+            f"Material '{name}' is black and shows only its emission, which was read as its albedo, also in "
+            "finished assets."
         )
     elif emits(entry):
         notes.append(
-            f"Material '{name}' emits light, which the views that are painted leave out; it stays in a finished asset "
-            "and is added to the painting."
+            f"Material '{name}' emits light, which painted views omit; it stays in a finished asset and is added "
+            "to the painting."
         )
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         notes.append(f"Material '{name}' is unlit: without --lit, viewers of a result show its albedo alone.")
@@ -137,20 +137,18 @@ def _unseen(tree: Tree, index: int) -> list[str]:
 
 
 def _left_out(tree: Tree, index: int, name: str) -> list[str]:
-    """Notes of what is in a material and not in its maps: alpha, extensions, and defaults that were read otherwise."""
+    """Notes on properties of a material that its maps lack: alpha, extensions, and defaults that were replaced."""
     entry, notes = tree["materials"][index], []
     if sees_through(tree, index):
-        how = "cut out" if entry["alphaMode"] == "MASK" else "blended"
+        mode = "cut out" if entry["alphaMode"] == "MASK" else "blended"
         notes.append(
-            f"Material '{name}' is {how} by its alpha, which stays in a finished asset; the views that are painted "
-            "show it whole."
+            f"Material '{name}' is {mode} by its alpha, which stays in a finished asset; painted views show it opaque."
         )
     more = sorted(n for n in entry.get("extensions", {}) if n.startswith("KHR_materials_") and n not in _READ)
     drawn = [n for n in more if n in _DRAWN]
     if drawn:
         notes.append(
-            f"Material '{name}' has {', '.join(drawn)}, which stays in a finished asset; the views that are painted "
-            "leave it out."
+            f"Material '{name}' has {', '.join(drawn)}, which stays in a finished asset; painted views omit it."
         )
     with_maps = [n for n in drawn if any(k.endswith("Texture") for k in extension(entry["extensions"], n))]
     if any(n != "KHR_materials_specular" for n in with_maps):
@@ -167,15 +165,14 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
         )
     elif "pbrMetallicRoughness" not in entry and "KHR_materials_unlit" not in entry.get("extensions", {}):
         notes.append(
-            f"Material '{name}' leaves metalness and roughness open: it is drawn as rough metal, glTF's default, and "
+            f"Material '{name}' sets neither metalness nor roughness: it is drawn as rough metal, glTF's default, and "
             "painted as a dielectric of roughness 0.5."
         )
     return notes
 
 
 def _image(tree: Tree, buffers: Buffers, path: Path, texture: int, notes: list[str]) -> tuple[str, bytes] | None:
-    """Where a texture's image comes from, and its bytes; None with a note where it is not there or of a kind that
-    cannot be read."""
+    """The source of a texture's image, and its bytes; None with a note where it is missing or unreadable."""
     source = image_of(tree, texture)
     if source is None:
         notes.append(f"Texture {texture} has no PNG, JPEG, WebP or AVIF image and was left out.")

@@ -1,11 +1,11 @@
-"""Writing a user's glTF again with new textures and otherwise as it was.
+"""Writer of a user's glTF with new textures and otherwise unchanged content.
 
-Nodes, names, skins, animations, cameras, extras and extensions are taken over as they are, vertex attributes byte by
-byte. What changes: textures of the painted materials; TANGENT (MikkTSpace) of the painted primitives; their COLOR_0,
-which viewers would multiply the painting by, goes (reading took it into the albedo); where the mesh was unwrapped anew
-or its texture coordinates were transformed, the next free TEXCOORD set. Where corners of one vertex need different
-tangents or texture coordinates, copies of the vertex are appended behind the old ones with everything it carries
-(joints, weights, morph targets, custom attributes), so old vertex numbers stay valid.
+Nodes, names, skins, animations, cameras, extras and extensions are copied unchanged, vertex attributes byte by byte.
+These change: textures of the painted materials, and TANGENT (MikkTSpace) of the painted primitives. Their COLOR_0 is
+removed, since viewers would multiply the painting by it (it is part of the albedo). A mesh that was unwrapped anew, or
+whose texture coordinates were transformed, gets the next free TEXCOORD set. Where corners of one vertex need different
+tangents or texture coordinates, copies of the vertex are appended, so old vertex indices stay valid. The
+copies have all attributes (joints, weights, morph targets, custom ones).
 """
 
 import copy
@@ -34,9 +34,8 @@ SAME_UV = 1e-5
 def patch_tree(asset: Asset, pictures: Sequence[Pictures], *, name: str, provenance: dict) -> Builder:
     """The user's file (asset.source.path, read again) with the new textures, ready to be packed.
 
-    Nodes that show the same mesh keep sharing it as long as they were painted with the same texture coordinates;
-    otherwise each further node gets a copy of the mesh. Raises MistyleError when the file is no longer the one that
-    was read.
+    Nodes that share a mesh keep it if they were painted with the same texture coordinates; otherwise each further node
+    gets a copy of the mesh. Raises MistyleError when the file has changed since it was read.
     """
     tree, buffers = load_gltf(asset.source.path)
     tree = copy.deepcopy(tree)
@@ -61,7 +60,7 @@ def patch_tree(asset: Asset, pictures: Sequence[Pictures], *, name: str, provena
 
 
 def _drop_colours(tree: Tree, patches: Sequence[Patch]) -> None:
-    """Take the vertex colours from the painted primitives, and those that their morph targets add."""
+    """Remove the vertex colours of the painted primitives and of their morph targets."""
     for patch in patches:
         primitive = tree["meshes"][patch.mesh]["primitives"][patch.primitive]
         for group in (primitive["attributes"], *primitive.get("targets", [])):
@@ -69,7 +68,8 @@ def _drop_colours(tree: Tree, patches: Sequence[Patch]) -> None:
 
 
 def _patches(tree: Tree, buffers: Buffers, asset: Asset) -> dict[int, list[Patch]]:
-    """What every node's primitives get, by node, in the winding of the file. texcoord is where the UVs were read."""
+    """The patches of every node's primitives, in the file's winding; `texcoord` is the set from which the UVs were
+    read."""
     groups: dict[tuple[int, int, int], list[Primitive]] = defaultdict(list)
     for primitive in asset.source.primitives:
         groups[primitive.node, primitive.mesh, primitive.primitive].append(primitive)
@@ -98,21 +98,21 @@ def _patches(tree: Tree, buffers: Buffers, asset: Asset) -> dict[int, list[Patch
 def _separate_nodes(tree: Tree, patches: dict[int, list[Patch]]) -> list[Patch]:
     """One patch per primitive: nodes of one mesh that were painted differently get copies of the mesh."""
     variants: dict[int, list[list[Patch]]] = defaultdict(list)
-    for node, mine in patches.items():
-        mesh = mine[0].mesh
-        known = next((v for v in variants[mesh] if _alike(v, mine)), None)
+    for node, own in patches.items():
+        mesh = own[0].mesh
+        known = next((v for v in variants[mesh] if _equal(v, own)), None)
         if known is None and variants[mesh]:
             tree["meshes"].append(copy.deepcopy(tree["meshes"][mesh]))
-            known = [replace(p, mesh=len(tree["meshes"]) - 1) for p in mine]
+            known = [replace(p, mesh=len(tree["meshes"]) - 1) for p in own]
             variants[mesh].append(known)
         elif known is None:
-            variants[mesh].append(mine)
+            variants[mesh].append(own)
             continue
         tree["nodes"][node]["mesh"] = known[0].mesh
     return [p for mesh in sorted(variants) for variant in variants[mesh] for p in variant]
 
 
-def _alike(a: list[Patch], b: list[Patch]) -> bool:
+def _equal(a: list[Patch], b: list[Patch]) -> bool:
     same = [x.primitive for x in a] == [x.primitive for x in b]
     return same and all(
         np.array_equal(x.part, y.part) and np.abs(_but_for_tiles(x.uvs - y.uvs)).max(initial=0) < SAME_UV
@@ -121,14 +121,14 @@ def _alike(a: list[Patch], b: list[Patch]) -> bool:
 
 
 def _but_for_tiles(difference: np.ndarray) -> np.ndarray:
-    """Differences of corner UVs (f 3 2) without whole tiles by which faces were moved."""
+    """Differences of corner UVs (f 3 2) modulo the whole tiles by which faces were moved."""
     return difference - np.rint(difference[:, :1])
 
 
 def _with_texcoords(tree: Tree, buffers: Buffers, patches: list[Patch]) -> list[Patch]:
-    """Decide per material whether the file's own set serves (modulo 1), or the UVs go to a new one.
+    """Decide per material whether the file's own set suffices (modulo 1), or the UVs need a new one.
 
-    All textures of a material name one set, so one primitive that needs a new set takes the others along.
+    All textures of a material use one set, so all primitives of a material get a new set if one needs it.
     """
     members: dict[int, list[Patch]] = defaultdict(list)
     for patch in patches:
@@ -175,14 +175,14 @@ def _repeating(tree: Tree, buffers: Buffers, patches: list[Patch]) -> set[int]:
 def _set_materials(
     builder: Builder, asset: Asset, patches: list[Patch], pictures: Sequence[Pictures], repeating: set[int], name: str
 ) -> dict[tuple[int, int], int]:
-    """Give the painted materials new textures; (material in the file, part) to the number of the material to use.
+    """Give the painted materials new textures; returns (material in the file, part) to index of the new material.
 
-    A material keeps its place unless something unpainted (lines, meshes outside the scene) shows it too; then, and
-    for every further texture set of a UDIM material, a copy is appended.
+    A material keeps its index unless unpainted primitives (lines, meshes outside the scene) use it too. Then, and for
+    every further texture set of a UDIM material, a copy is appended.
     """
     tree, stems = builder.tree, part_stems(name, asset.mesh.parts)
     painted = {(p.mesh, p.primitive) for p in patches}
-    elsewhere = {
+    unpainted = {
         primitive.get("material", -1)
         for m, mesh in enumerate(tree["meshes"])
         for n, primitive in enumerate(mesh["primitives"])
@@ -190,10 +190,10 @@ def _set_materials(
     }
     originals = copy.deepcopy(tree.get("materials", []))
     textures: dict[int, dict[str, int]] = {}
-    made: dict[tuple[int, int], int] = {}
+    indices: dict[tuple[int, int], int] = {}
     for patch in patches:
         for part in np.unique(patch.part).tolist():
-            if (patch.material, part) in made:
+            if (patch.material, part) in indices:
                 continue
             if part not in textures:
                 textures[part] = add_textures(builder, pictures[part], stems[part], repeat=part in repeating)
@@ -203,15 +203,15 @@ def _set_materials(
             if asset.source.lit:
                 drop_extension(material, "KHR_materials_unlit")
             set_textures(material, textures[part], patch.fresh[-1] if patch.fresh else patch.texcoord)
-            further = any(m == patch.material for m, _ in made)
+            further = any(m == patch.material for m, _ in indices)
             if patch.material < 0 or further:
                 material["name"] = asset.materials[part].name
-            if patch.material < 0 or further or patch.material in elsewhere:
-                made[patch.material, part] = builder.put("materials", material)
+            if patch.material < 0 or further or patch.material in unpainted:
+                indices[patch.material, part] = builder.put("materials", material)
             else:
-                made[patch.material, part] = patch.material
+                indices[patch.material, part] = patch.material
                 tree["materials"][patch.material] = material
-    return made
+    return indices
 
 
 def _divide(builder: Builder, patch: Patch, faces: np.ndarray, materials: dict[tuple[int, int], int]) -> None:
@@ -221,16 +221,16 @@ def _divide(builder: Builder, patch: Patch, faces: np.ndarray, materials: dict[t
     first, *rest = np.unique(patch.part).tolist()
     primitive["material"] = materials[patch.material, first]
     for part in rest:
-        other = copy.deepcopy(primitive) | {"material": materials[patch.material, part], "mode": TRIANGLES}
-        other["indices"] = builder.indices(faces[patch.part == part])
-        primitives.append(other)
+        copied = copy.deepcopy(primitive) | {"material": materials[patch.material, part], "mode": TRIANGLES}
+        copied["indices"] = builder.indices(faces[patch.part == part])
+        primitives.append(copied)
     if rest:
         primitive |= {"indices": builder.indices(faces[patch.part == first]), "mode": TRIANGLES}
 
 
 def _embed_images(builder: Builder, buffers: Buffers, asset: Asset) -> list[str]:
-    """Put the images that are still needed and lie beside the file into it; the names of those that are not there,
-    for which a white pixel stands in (the same as no texture)."""
+    """Embed the remaining images that lie beside the file. Returns the names of missing ones, which a white pixel
+    replaces (equal to no texture)."""
     missing = []
     for image in builder.tree.get("images", []):
         if "uri" in image:

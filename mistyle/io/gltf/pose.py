@@ -1,4 +1,4 @@
-"""Where a glTF file's vertices stand at rest: morph weights, joints at their nodes' places, instances of a mesh."""
+"""Vertex positions of a glTF file at rest: morph weights, skinning by the joints' nodes, instances of a mesh."""
 
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,11 @@ Tree = dict[str, Any]
 Places = Float[np.ndarray, "*n 4 4"]  # one matrix for all vertices, or one for each
 INSTANCING = "EXT_mesh_gpu_instancing"
 MAX_WEIGHT = 1e3
-SAME = 1e-5  # joint matrices that differ by less, relative to their size, are one
+SAME = 1e-5  # joint matrices that differ by less, relative to their size, are equal
 
 
 def posed(local: Float[np.ndarray, "v 3"], places: Places) -> Float[np.ndarray, "v 3"]:
-    """Positions in world space; where that is the file's own, its float32 as they are: half of the bytes."""
+    """Positions in world space; for an identity transform the file's own float32, half of the bytes."""
     if places.ndim == 3:
         return np.einsum("nij,nj->ni", places[:, :3, :3], local.astype(np.float64)) + places[:, :3, 3]
     if local.dtype == np.float32 and np.array_equal(places, np.eye(4)):
@@ -40,7 +40,7 @@ def turned(vectors: Float[np.ndarray, "v 3"], places: Places) -> Float[np.ndarra
 
 
 def mirrors(places: Places) -> bool:
-    """Whether a place mirrors space (most vertices decide)."""
+    """Whether the transforms mirror space (by majority of vertices)."""
     return bool(np.median(np.linalg.det(places[..., :3, :3])) < 0)
 
 
@@ -48,24 +48,24 @@ def morphed(
     tree: Tree, buffers: Buffers, node: Tree, primitive: Tree, name: str, base: np.ndarray
 ) -> Float[np.ndarray, "v 3"]:
     """An attribute (POSITION or NORMAL) at the morph weights of the node, else of its mesh (glTF 2.0, 3.7.2.2)."""
-    said = node.get("weights") or tree["meshes"][node["mesh"]].get("weights")
-    weights = said if isinstance(said, list) else []
+    entry = node.get("weights") or tree["meshes"][node["mesh"]].get("weights")
+    weights = entry if isinstance(entry, list) else []
     result = base
     for weight, target in zip(weights, primitive.get("targets", []), strict=False):
-        by = number({"weight": weight}, "weight", 0.0, -MAX_WEIGHT, MAX_WEIGHT)
-        if by == 0 or name not in target:
+        factor = number({"weight": weight}, "weight", 0.0, -MAX_WEIGHT, MAX_WEIGHT)
+        if factor == 0 or name not in target:
             continue
         step = values(tree, buffers, target[name])
         if step.shape == base.shape:
-            result = result + by * step.astype(np.float64)
+            result = result + factor * step.astype(np.float64)
     return result
 
 
 def skinned(
     tree: Tree, buffers: Buffers, joints: Float[np.ndarray, "j 4 4"], primitive: Tree, rest: Places, path: Path
 ) -> Places:
-    """The matrices of a primitive's vertices: their joints' by weight, `rest` for vertices without any. One matrix
-    where all joints that count have the same, as in the pose that the skin was bound in."""
+    """The matrices of a primitive's vertices: the weighted sum of their joints', `rest` for vertices without any. One
+    matrix where all used joints have the same one, as in the bind pose."""
     attributes = primitive["attributes"]
     total = np.zeros((tree["accessors"][attributes["POSITION"]]["count"], 4, 4))
     sums = np.zeros(len(total))
@@ -92,7 +92,7 @@ def skinned(
 def joint_matrices(
     tree: Tree, buffers: Buffers, skin: int, world: list[np.ndarray], path: Path
 ) -> tuple[Float[np.ndarray, "j 4 4"], int]:
-    """World matrix times inverse bind matrix of every joint, and the number of the joint that is the root."""
+    """World matrix times inverse bind matrix of every joint, and the index of the root joint."""
     joints = tree["skins"][skin]["joints"]
     below = {c for j in joints for c in tree["nodes"][j].get("children", [])}
     root = next((k for k, j in enumerate(joints) if j not in below), 0)
@@ -108,18 +108,18 @@ def joint_matrices(
 
 
 def instances(tree: Tree, buffers: Buffers, node: Tree, notes: list[str]) -> list[Float[np.ndarray, "4 4"]]:
-    """The matrices of a node's instances relative to it; one that changes nothing where it has none."""
+    """The matrices of a node's instances relative to it; the identity where it has none."""
     from scipy.spatial.transform import Rotation
 
-    said = node.get("extensions", {}).get(INSTANCING)
-    if said is None:
+    entry = node.get("extensions", {}).get(INSTANCING)
+    if entry is None:
         return [np.eye(4)]
-    given = said.get("attributes") if isinstance(said, dict) else None
+    attributes = entry.get("attributes") if isinstance(entry, dict) else None
     kinds = {"TRANSLATION": "VEC3", "ROTATION": "VEC4", "SCALE": "VEC3"}
-    found = {name: (given or {}).get(name) for name in kinds}
+    indices = {name: (attributes or {}).get(name) for name in kinds}
     known, count = tree.get("accessors", []), None
     arrays: dict[str, np.ndarray] = {}
-    for name, index in found.items():
+    for name, index in indices.items():
         if index is None:
             continue
         fits = isinstance(index, int) and 0 <= index < len(known) and known[index]["type"] == kinds[name]

@@ -1,4 +1,4 @@
-"""glTF to triangles: node transforms, skins in the pose of their joints, morphs, instances, strips, fans, materials."""
+"""Reader of glTF: triangles with node transforms, posed skins, morphs, instances, strips, fans and materials."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,7 +44,7 @@ class _PrimitivePiece:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a primitive's vertices stand: their first number, their positions in world space and their matrices."""
+    """A primitive's vertices in world space: their first index, their positions and their matrices."""
 
     node: int
     start: int
@@ -55,14 +55,14 @@ class _Place:
 def read_gltf(path: Path, max_faces: int) -> Indexed:
     """Triangles of the default scene (of all nodes where there is none), in node order and file order.
 
-    Positions are in world space, node transforms applied. A skinned mesh comes in the pose that its joints' nodes have:
-    its own node's transform has no meaning (glTF 2.0, 3.7.3.3). Morph targets count by the weights that the file gives
-    them. Primitives of points and lines, hidden nodes (KHR_node_visibility) and nodes scaled to nothing
-    are left out with a note. Where NORMAL is missing faces are flat, as the specification demands.
+    Positions are in world space, node transforms applied. A skinned mesh has the pose of its joints' nodes: its own
+    node's transform is ignored (glTF 2.0, 3.7.3.3). Morph targets apply with the file's weights. Points, lines, hidden
+    nodes (KHR_node_visibility) and nodes of zero scale are dropped with a note. Faces without NORMAL are flat, as the
+    specification demands.
     """
     notes: list[str] = []
     tree, buffers = load_gltf(path, notes.append)
-    with np.errstate(over="ignore", invalid="ignore"):  # transforms may overflow; what comes of it is refused
+    with np.errstate(over="ignore", invalid="ignore"):  # transforms may overflow; infinite results are refused
         pieces, positions = _pieces(tree, buffers, path, max_faces, notes)
     if not pieces:
         raise refuse(
@@ -73,7 +73,7 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
         )
     used = sorted({p.material for p in pieces})
     counts = [len(p.faces) for p in pieces]
-    # All of it goes from one process to another, in as few bytes as hold it.
+    # The smallest integer type: the array is sent between processes.
     kind = np.min_scalar_type(-len(used))
     material = np.repeat(np.array([used.index(p.material) for p in pieces], kind), counts)
     materials = _materials(tree, buffers, path, pieces, used, notes)
@@ -108,7 +108,7 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
 def _materials(
     tree: Tree, buffers: Buffers, path: Path, pieces: list[_PrimitivePiece], used: list[int], notes: list[str]
 ) -> tuple[RawMaterial, ...]:
-    """The materials `used` by the pieces, by their numbers in the file; -1 is a primitive without one."""
+    """The materials `used` by the pieces, by their indices in the file; -1 is a primitive without one."""
     budget = Budget(path)
     materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
     if -1 not in used:
@@ -124,13 +124,13 @@ def _materials(
 
 
 def _factors(
-    found: list[Corners | None], counts: list[int], width: int, faces: Int[np.ndarray, "f 3"]
+    pieces: list[Corners | None], counts: list[int], width: int, faces: Int[np.ndarray, "f 3"]
 ) -> Corners | None:
-    """Factors of all pieces' corners, 1 for pieces without; None where every factor is 1."""
-    if not any(corners is not None and (corners.values != 1).any() for corners in found):
+    """Concatenated factors of all pieces' corners, 1 for pieces without; None where every factor is 1."""
+    if not any(corners is not None and (corners.values != 1).any() for corners in pieces):
         return None
     ones = [1.0] * width
-    return _joined([c or _same_for_all(count, ones) for c, count in zip(found, counts, strict=True)], faces)
+    return _joined([c or _same_for_all(count, ones) for c, count in zip(pieces, counts, strict=True)], faces)
 
 
 def _same_for_all(faces: int, values: list[float]) -> Corners:
@@ -138,7 +138,7 @@ def _same_for_all(faces: int, values: list[float]) -> Corners:
 
 
 def _joined(corners: list[Corners], faces: Int[np.ndarray, "f 3"]) -> Corners:
-    """One behind the other. Indices that are the faces' own are the same array, which is sent once."""
+    """Concatenated corners. Indices equal to `faces` are returned as that array, which is then sent only once."""
     starts = np.cumsum([0, *(len(c.values) for c in corners)])
     index = np.concatenate([c.index + np.int32(start) for c, start in zip(corners, starts[:-1], strict=True)])
     same = np.array_equal(index, faces)
@@ -200,27 +200,27 @@ def _place(
 
 
 def _vertices_of(primitive: Tree) -> str:
-    """What decides where a primitive's vertices stand: their accessors' numbers."""
-    named = primitive["attributes"].items()
-    own = sorted((n, a) for n, a in named if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_")))
+    """A key of a primitive's vertex positions: their accessors' indices."""
+    attributes = primitive["attributes"].items()
+    own = sorted((n, a) for n, a in attributes if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_")))
     return str([own, [target.get("POSITION") for target in primitive.get("targets", [])]])
 
 
 def _instances(tree: Tree, buffers: Buffers, node: Tree, room: int, notes: list[str]) -> list[np.ndarray]:
-    """The matrices of a node's instances; the first alone where there is no `room` for the faces of all."""
-    found = instances(tree, buffers, node, notes)
-    if len(found) <= 1 or "skin" in node:
-        return found[:1]
+    """The matrices of a node's instances; only the first where the faces of all exceed `room`."""
+    matrices = instances(tree, buffers, node, notes)
+    if len(matrices) <= 1 or "skin" in node:
+        return matrices[:1]
     primitives = [p for p in tree["meshes"][node["mesh"]]["primitives"] if "POSITION" in p["attributes"]]
     corners = sum(tree["accessors"][p.get("indices", p["attributes"]["POSITION"])]["count"] for p in primitives)
-    if len(found) * corners > 3 * room:
-        notes.append(f"Only the first of {len(found)} instances ({INSTANCING}) was read; all show the same texels.")
-        return found[:1]
-    return found
+    if len(matrices) * corners > 3 * room:
+        notes.append(f"Only the first of {len(matrices)} instances ({INSTANCING}) was read; all show the same texels.")
+        return matrices[:1]
+    return matrices
 
 
 def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:
-    """Whether nothing with an area is left of what a node shows."""
+    """Whether a transform collapses all areas to zero."""
     first, second, _ = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     return bool(second <= 1e-9 * first)
 
@@ -228,7 +228,7 @@ def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:
 def _piece(
     tree: Tree, buffers: Buffers, path: Path, where: _Place, number: int, index, notes: list[str]
 ) -> _PrimitivePiece:
-    """One primitive's corners in world space, v up; the winding is turned where the node mirrors space."""
+    """One primitive's corners in world space, v up; the winding is flipped where the node mirrors space."""
     node = tree["nodes"][where.node]
     primitive = tree["meshes"][node["mesh"]]["primitives"][number]
     attributes = primitive["attributes"]
@@ -272,7 +272,7 @@ def _piece(
 
 
 def _check_counts(tree: Tree, primitive: Tree, max_faces: int, path: Path) -> None:
-    """Before anything is decoded: accessors without a buffer view announce any number of zeros in a few bytes."""
+    """Check counts before decoding: accessors without a buffer view can declare any number of zeros in a few bytes."""
     for name, accessor in primitive["attributes"].items():
         too_many(tree["accessors"][accessor]["count"], 3 * max_faces, path, f"elements of {name[:40]}")
     if "indices" in primitive:
@@ -304,15 +304,15 @@ def _colours(tree: Tree, buffers: Buffers, accessor: int, path: Path) -> Float[n
     kind = tree["accessors"][accessor]
     if kind["type"] not in ("VEC3", "VEC4"):
         raise refuse(path, f"vertex colours of {kind['type']}", "VEC3 or VEC4", AGAIN)
-    found = values(tree, buffers, accessor)
-    if found.dtype.kind != "f":  # whole numbers that the file forgot to call normalised
-        found = found / np.float32(np.iinfo(found.dtype).max)
-    return np.clip(np.nan_to_num(found.astype(np.float32), nan=1.0), 0, 1)
+    raw = values(tree, buffers, accessor)
+    if raw.dtype.kind != "f":  # integers without the normalised flag
+        raw = raw / np.float32(np.iinfo(raw.dtype).max)
+    return np.clip(np.nan_to_num(raw.astype(np.float32), nan=1.0), 0, 1)
 
 
 def _hidden(node: Tree) -> bool:
-    said = node.get("extensions", {}).get("KHR_node_visibility")
-    return isinstance(said, dict) and said.get("visible", True) is False
+    visibility = node.get("extensions", {}).get("KHR_node_visibility")
+    return isinstance(visibility, dict) and visibility.get("visible", True) is False
 
 
 def _scene_nodes(tree: Tree, notes: list[str]) -> list[int]:
@@ -370,13 +370,15 @@ def world_matrices(tree: Tree) -> list[Float[np.ndarray, "4 4"]]:
 def _other_sets(pieces: list[_PrimitivePiece], material: int) -> dict[int, Float[np.ndarray, "f 3 2"]]:
     """The UV sets besides the base that a material's textures use, for all faces; NaN where a face has none."""
     numbers = {n for p in pieces if p.material == material for n in p.other_uvs}
-    nothing = [np.full((len(p.faces), 3, 2), np.nan, np.float32) for p in pieces]
-    return {n: np.concatenate([p.other_uvs.get(n, no) for p, no in zip(pieces, nothing, strict=True)]) for n in numbers}
+    blanks = [np.full((len(p.faces), 3, 2), np.nan, np.float32) for p in pieces]
+    return {
+        n: np.concatenate([p.other_uvs.get(n, blank) for p, blank in zip(pieces, blanks, strict=True)]) for n in numbers
+    }
 
 
 def _twins(pieces: list[_PrimitivePiece], starts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " f"] | None:
-    """For each face the first face that the file's same primitive gave; instances share the file's UVs. None where
-    there are no instances."""
+    """For each face the corresponding face of the primitive's first instance; instances share UVs. None without
+    instances."""
     if len({(piece.mesh, piece.primitive) for piece in pieces}) == len(pieces):
         return None
     twin = np.arange(starts[-1])

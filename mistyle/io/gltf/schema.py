@@ -1,4 +1,4 @@
-"""The parts of glTF's JSON that reading and patching rely on, with their types and ranges (glTF 2.0, chapter 5)."""
+"""Schema of glTF's JSON for reading and patching, with types and ranges (glTF 2.0, chapter 5)."""
 
 from typing import Any
 
@@ -134,7 +134,7 @@ class JsonAsset(JsonObject):
 
 
 class Document(JsonObject):
-    """The whole file."""
+    """The whole JSON document."""
 
     asset: JsonAsset
     accessors: list[JsonAccessor] = []

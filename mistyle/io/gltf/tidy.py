@@ -1,4 +1,4 @@
-"""What a patched glTF no longer needs: textures, images, samplers, buffer views and extension names."""
+"""Removal of unused textures, images, samplers, buffer views and extension names from a patched glTF."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 from mistyle.core.errors import InputRefused
 from mistyle.io.gltf.glb import Builder, Tree
 
-# Extensions that name textures, images and buffer views only where core glTF does or in "...Texture" and "source".
+# Extensions that reference textures, images and buffer views only as core glTF does or in "...Texture" and "source".
 _UNDERSTOOD = (
     "KHR_materials_",
     "EXT_texture_webp",
@@ -21,7 +21,7 @@ _UNDERSTOOD = (
     "EXT_mesh_gpu_instancing",
     "MSFT_lod",
 )
-# Extensions that may have gone with the replaced textures.
+# Extensions that may have been removed with the replaced textures.
 _GOES_WITH_TEXTURES = (
     "KHR_texture_transform",
     "KHR_materials_pbrSpecularGlossiness",
@@ -34,10 +34,10 @@ _GOES_WITH_TEXTURES = (
 
 
 def drop_unused(builder: Builder) -> None:
-    """Remove textures, images, samplers and buffer views that nothing names any more, and renumber the rest.
+    """Remove textures, images, samplers and buffer views without references, and renumber the rest.
 
-    Accessors, materials, meshes and nodes keep their numbers. In a file with an extension that may name images or
-    buffer views in ways not known here, everything stays.
+    Accessors, materials, meshes and nodes keep their indices. A file with an extension that may reference images or
+    buffer views in unknown ways stays unchanged.
     """
     tree = builder.tree
     _forget_extensions(tree)
@@ -54,26 +54,26 @@ def drop_unused(builder: Builder) -> None:
     _renumber(tree, "samplers", [(t, "sampler") for t in textures if "sampler" in t])
     parts = [a["sparse"][k] for a in tree.get("accessors", []) if "sparse" in a for k in ("indices", "values")]
     owners = [*tree.get("accessors", []), *parts, *tree.get("images", [])]
-    kept = _renumber(tree, "bufferViews", [(o, "bufferView") for o in owners if "bufferView" in o])
-    builder.blobs[:] = [builder.blobs[i] for i in kept]
+    remaining = _renumber(tree, "bufferViews", [(o, "bufferView") for o in owners if "bufferView" in o])
+    builder.blobs[:] = [builder.blobs[i] for i in remaining]
 
 
 def _renumber(tree: Tree, key: str, references: list[tuple[Tree, str]]) -> list[int]:
-    """Keep the entries of tree[key] that are referred to, point the references at their new numbers; the old ones."""
+    """Keep the referenced entries of tree[key] and renumber the references; returns the kept entries' old indices."""
     count = len(tree.get(key, []))
     for owner, field in references:
         if not isinstance(owner[field], int) or not 0 <= owner[field] < count:
-            found = f"{key} number {owner[field]!r} of {count}"
-            raise InputRefused(f"the glTF file names {found}; it is damaged, export it again")
-    kept = sorted({owner[field] for owner, field in references})
-    new = {old: number for number, old in enumerate(kept)}
+            reference = f"{key} number {owner[field]!r} of {count}"
+            raise InputRefused(f"the glTF file names {reference}; it is damaged, export it again")
+    used = sorted({owner[field] for owner, field in references})
+    new = {old: number for number, old in enumerate(used)}
     for owner, field in references:
         owner[field] = new[owner[field]]
     if key in tree:
-        tree[key] = [tree[key][i] for i in kept]
-        if not kept:
+        tree[key] = [tree[key][i] for i in used]
+        if not used:
             del tree[key]  # glTF forbids empty lists
-    return kept
+    return used
 
 
 def _texture_infos(node: Any) -> Iterator[Tree]:

@@ -1,4 +1,4 @@
-"""New vertex attributes for primitives of a user's glTF: old vertices stay in place, copies follow behind them."""
+"""New vertex attributes for primitives of a user's glTF: old vertices keep their indices, copies are appended."""
 
 import json
 from collections import Counter, defaultdict
@@ -15,9 +15,9 @@ from mistyle.io.gltf.glb import FAN, STRIP, TRIANGLES, Buffers, Builder, Tree, e
 
 @dataclass(frozen=True)
 class Patch:
-    """A painted primitive of the file: its faces in the file's own vertex numbers and winding, UVs and parts.
+    """A painted primitive of the file: its faces in the file's own vertex indices and winding, UVs and parts.
 
-    `uvs` are per corner, v up. With `texcoord` >= 0 the file's own set of that number is used and stays as it is;
+    `uvs` are per corner, v up. With `texcoord` >= 0 the file's own set of that number is used and stays unchanged;
     else `uvs` are written to the sets TEXCOORD_n of `fresh` (several, where gaps must be filled).
     """
 
@@ -32,7 +32,7 @@ class Patch:
 
 
 def triangles(tree: Tree, buffers: Buffers, primitive: Tree) -> Int[np.ndarray, "f 3"] | None:
-    """The triangles of a primitive, strips and fans spelled out as the specification orders them; None for others."""
+    """The triangles of a primitive, with strips and fans expanded as specified; None for points and lines."""
     mode = primitive.get("mode", TRIANGLES)
     if mode not in (TRIANGLES, STRIP, FAN):
         return None
@@ -49,18 +49,18 @@ def triangles(tree: Tree, buffers: Buffers, primitive: Tree) -> Int[np.ndarray, 
 
 
 def rewrite(builder: Builder, buffers: Buffers, patches: Sequence[Patch]) -> dict[tuple[int, int], np.ndarray]:
-    """Give the painted primitives TANGENT, and where they need them NORMAL and fresh TEXCOORD sets.
+    """Give the painted primitives TANGENT and, where needed, NORMAL and new TEXCOORD sets.
 
-    Returns the new vertex numbers of each patch's faces by (mesh, primitive). A file without normals is shaded flat
-    by the specification: the added NORMAL says so, since TANGENT needs it. Tangents of morph targets are kept with
-    the file's own texture coordinates and dropped with fresh ones, which they do not belong to.
+    Returns the new vertex indices of each patch's faces by (mesh, primitive). The specification shades a file without
+    normals flat; the added NORMAL encodes this, since TANGENT needs it. Tangents of morph targets are kept with the
+    file's own texture coordinates and dropped with new ones, which they do not match.
     """
     families = _families(builder.tree)
     owners = _owners(builder.tree, families)
-    mine = {(p.mesh, p.primitive): p for p in patches}
+    by_primitive = {(p.mesh, p.primitive): p for p in patches}
     result: dict[tuple[int, int], np.ndarray] = {}
     for number, members in enumerate(families):
-        pool = [mine[m] for m in members if m in mine]
+        pool = [by_primitive[m] for m in members if m in by_primitive]
         if pool:
             result |= _rewrite_family(_Family(builder, buffers, number, members, pool, owners))
     return result
@@ -68,16 +68,16 @@ def rewrite(builder: Builder, buffers: Buffers, patches: Sequence[Patch]) -> dic
 
 def _families(tree: Tree) -> list[list[tuple[int, int]]]:
     """(mesh, primitive) of primitives that share all their vertices (attributes and morph targets of one mesh)."""
-    found: dict[str, list[tuple[int, int]]] = defaultdict(list)
+    groups: dict[str, list[tuple[int, int]]] = defaultdict(list)
     for m, mesh in enumerate(tree["meshes"]):
         for n, primitive in enumerate(mesh["primitives"]):
             shared = [m, primitive["attributes"], primitive.get("targets", [])]
-            found[json.dumps(shared, sort_keys=True)].append((m, n))
-    return list(found.values())
+            groups[json.dumps(shared, sort_keys=True)].append((m, n))
+    return list(groups.values())
 
 
 def _owners(tree: Tree, families: list[list[tuple[int, int]]]) -> dict[int, Counter[int]]:
-    """Who uses each accessor how often: numbers of families, -1 for skins, animations and instancing."""
+    """Users of each accessor with counts: indices of families, -1 for skins, animations and instancing."""
     owners: dict[int, Counter[int]] = defaultdict(Counter)
     for number, members in enumerate(families):
         primitives = [tree["meshes"][m]["primitives"][n] for m, n in members]
@@ -87,12 +87,12 @@ def _owners(tree: Tree, families: list[list[tuple[int, int]]]) -> dict[int, Coun
         for primitive in primitives:
             if "indices" in primitive:
                 owners[primitive["indices"]][number] += 1
-    others = [s["inverseBindMatrices"] for s in tree.get("skins", []) if "inverseBindMatrices" in s]
+    external = [s["inverseBindMatrices"] for s in tree.get("skins", []) if "inverseBindMatrices" in s]
     samplers = [s for a in tree.get("animations", []) for s in a.get("samplers", [])]
-    others += [s[k] for s in samplers for k in ("input", "output") if k in s]
+    external += [s[k] for s in samplers for k in ("input", "output") if k in s]
     for node in tree.get("nodes", []):
-        others += node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {}).values()
-    for index in others:
+        external += node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {}).values()
+    for index in external:
         owners[index][-1] += 1
     return owners
 
@@ -125,7 +125,7 @@ def _rewrite_family(family: "_Family") -> dict[tuple[int, int], np.ndarray]:
 
 
 def _corner_values(tree: Tree, buffers: Buffers, pool: Sequence[Patch], attributes: Tree) -> dict[str, np.ndarray]:
-    """What is new at every corner of the pool, in file terms: name to (corners, 2..4) float32."""
+    """New attributes at every corner of the pool, in the file's conventions: name to (corners, 2..4) float32."""
     positions = values(tree, buffers, attributes["POSITION"]).astype(np.float32)
     with_normals = "NORMAL" in attributes
     old = unit_normals(values(tree, buffers, attributes["NORMAL"])) if with_normals else None
@@ -138,7 +138,7 @@ def _corner_values(tree: Tree, buffers: Buffers, pool: Sequence[Patch], attribut
         else:
             u, v = patch.uvs.reshape(-1, 2).astype(np.float32).T
             file_uvs = np.stack([u, 1 - v], axis=1)
-        # Tangents of glTF belong to v up; -v has the differences of the file's own numbers without their rounding.
+        # glTF's tangents are for v up; -v has the same differences as 1 - v, without its rounding.
         up = file_uvs * np.array([1, -1], np.float32)
         corners = np.arange(len(flat)).reshape(-1, 3)
         tangent.append(mikktspace(positions[flat], corner_normals, up, corners).reshape(-1, 4))
@@ -165,8 +165,8 @@ def split(
 ) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " e"], Int[np.ndarray, " m"]]:
     """Vertices for corners, so that equal vertices have equal keys.
 
-    Returns the new vertex of every corner, the old vertex of every appended one (numbers from `count` on), and one
-    corner of every vertex in use. One key of each old vertex keeps its number.
+    Returns the new vertex of every corner, the old vertex of every appended one (indices from `count` on), and one
+    corner of every vertex in use. One key of each old vertex keeps its index.
     """
     rows = corner_rows(corner_vertex, keys)
     chosen, inverse = distinct(rows)
@@ -177,44 +177,44 @@ def split(
 
 
 def _filler(name: str, count: int) -> np.ndarray:
-    """Values for vertices that no painted face uses (of lines, or of nothing)."""
-    rest = {"TANGENT": [1, 0, 0, 1], "NORMAL": [0, 1, 0], "fresh": [0, 0]}[name]
-    return np.tile(np.array(rest, np.float32), (count, 1))
+    """Values for vertices that no painted face uses (those of lines, or unused ones)."""
+    default = {"TANGENT": [1, 0, 0, 1], "NORMAL": [0, 1, 0], "fresh": [0, 0]}[name]
+    return np.tile(np.array(default, np.float32), (count, 1))
 
 
 class _Family:
-    """All primitives of a mesh that use the same vertices, painted or not, and the accessors that only they use."""
+    """All primitives of a mesh that use the same vertices, painted or not, and their exclusive accessors."""
 
     def __init__(self, builder: Builder, buffers: Buffers, number: int, members, pool: list[Patch], owners) -> None:
         self.builder, self.buffers, self.number, self.pool, self.owners = builder, buffers, number, pool, owners
         self.primitives = [builder.tree["meshes"][m]["primitives"][n] for m, n in members]
-        self.made: dict[int, int] = {}
+        self.replacements: dict[int, int] = {}
 
     def place(self, old: int | None, new: int) -> int:
-        """Move the accessor just added (`new` is the last) to the place of the one it replaces, if nothing else uses
-        that; where it is now."""
+        """Move the accessor just added (`new` is the last) to the index of the one that it replaces, if that has no
+        other user. Returns its index."""
         if old is None:
             return new
         users = self.owners[old]
-        if set(users) == {self.number} and (users[self.number] == 1 or old in self.made):
-            users[-1] += 1  # its place is taken now
+        if set(users) == {self.number} and (users[self.number] == 1 or old in self.replacements):
+            users[-1] += 1  # its index is in use now
             self.builder.tree["accessors"][old] = self.builder.tree["accessors"].pop()
             return old
         users -= Counter({self.number: 1})
         return new
 
     def extended(self, old: int, origin: np.ndarray) -> int:
-        """The accessor with the appended vertices' copies."""
-        if old not in self.made:
+        """The index of the accessor with the appended vertices' copies."""
+        if old not in self.replacements:
             elements = element_bytes(self.builder.tree, self.buffers, old)
             like = self.builder.tree["accessors"][old]
             new = self.builder.raw_attribute(np.concatenate([elements, elements[origin]]), like)
-            self.made[old] = new
-            self.made[old] = self.place(old, new)
-        return self.made[old]
+            self.replacements[old] = new
+            self.replacements[old] = self.place(old, new)
+        return self.replacements[old]
 
     def point_at(self, vertex: np.ndarray, count: int, more: bool) -> dict[tuple[int, int], np.ndarray]:
-        """Let the painted primitives' indices name the new vertices; unchanged ones stay as they are."""
+        """Point the painted primitives' indices at the new vertices; equal ones stay unchanged."""
         end, result = 0, {}
         for patch in self.pool:
             primitive = self.builder.tree["meshes"][patch.mesh]["primitives"][patch.primitive]

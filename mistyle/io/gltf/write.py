@@ -1,7 +1,7 @@
-"""Writing glTF 2.0 as one .glb: new files for meshes of other formats, patched ones for glTF (see gltf_patch).
+"""Writer of glTF 2.0 as one .glb: new files for meshes of other formats, patched ones for glTF (see patch.py).
 
-Memory has v up, glTF has its origin at the top left: texture coordinates are flipped here and in gltf_patch, and
-nowhere else; textures are never flipped (row 0 of a map is v = 1, the top row of its PNG).
+Memory has v up, glTF has its origin at the top left: texture coordinates are flipped here and in patch.py only.
+Textures are never flipped (row 0 of a map is v = 1, the top row of its PNG).
 """
 
 from collections.abc import Sequence
@@ -35,12 +35,12 @@ def write_glb(
     """Write the asset as a new .glb: a node per object that the source names, one material and set of textures per
     part, a primitive for each part of each object; atomically.
 
-    Positions are the user's: file units, file axes, corners in the order of the source's vertices. Where reading
-    turned the mesh upright (Z-up files) the node carries that rotation, since glTF's scene is Y-up; the position of a
-    mesh very far from its origin is split between node and vertices, which are float32. TANGENT is MikkTSpace.
-    `maps` and `occlusion` (1 is open) have one entry per part; `pictures` are their PNG files where already encoded,
-    and then nothing else of them is needed.
-    The same input gives the same bytes. The result is a still mesh: other formats have nothing else to keep.
+    Positions are the user's: file units, file axes, corners in the order of the source's vertices. For
+    Z-up files that reading has rotated, the node holds that rotation, since glTF's scene is Y-up. The position of a
+    mesh very far from its origin is split between node and float32 vertices. TANGENT is MikkTSpace.
+    `maps` and `occlusion` (1 is open) have one entry per part; `pictures` are their encoded
+    PNG files, which replace them. Equal inputs give equal bytes. The result is a static mesh: other formats have no
+    animation to keep.
     """
     pictures = pictures or [encode_pictures(m, o) for m, o in zip(maps, occlusion, strict=True)]
     rotation, offset = _node_frame(asset)
@@ -49,13 +49,13 @@ def write_glb(
         frame["translation"] = (rotation @ offset).tolist()
     if not np.array_equal(rotation, np.eye(3)):
         frame["rotation"] = _quaternion(rotation)
-    thing, things = _objects(asset)
+    object_of_face, objects = _objects(asset)
     tree: Tree = {
         "asset": {"version": "2.0", "generator": f"mistyle {__version__}", "extras": {"mistyle": provenance or {}}},
         "scene": 0,
-        "scenes": [{"name": name, "nodes": list(range(len(things)))}],
-        "nodes": [{"name": each, "mesh": k, **frame} for k, each in enumerate(things)],
-        "meshes": [{"name": each, "primitives": []} for each in things],
+        "scenes": [{"name": name, "nodes": list(range(len(objects)))}],
+        "nodes": [{"name": each, "mesh": k, **frame} for k, each in enumerate(objects)],
+        "meshes": [{"name": each, "primitives": []} for each in objects],
     }
     builder = Builder(tree, [])
     for part, stem in enumerate(part_stems(name, asset.mesh.parts)):
@@ -63,7 +63,7 @@ def write_glb(
             uvs = asset.mesh.corner_uvs[asset.mesh.part == part]
             textures = add_textures(builder, pictures[part], stem, repeat=_leaves_square(uvs))
             material = builder.put("materials", _material(asset, part, textures))
-            for k, primitive in _primitives(builder, asset, part, thing, rotation, offset):
+            for k, primitive in _primitives(builder, asset, part, object_of_face, rotation, offset):
                 tree["meshes"][k]["primitives"].append(primitive | {"material": material})
     atomic_write(path, builder.pack())
 
@@ -78,13 +78,13 @@ def patch_glb(
     provenance: dict | None = None,
     pictures: Sequence[Pictures] | None = None,
 ) -> None:
-    """Write the user's glTF again as one .glb in which only the materials' textures are new (see gltf_patch)."""
+    """Write the user's glTF as one .glb in which only the materials' textures are new (see patch.py)."""
     pictures = pictures or [encode_pictures(m, o) for m, o in zip(maps, occlusion, strict=True)]
     atomic_write(path, patch_tree(asset, pictures, name=name, provenance=provenance or {}).pack())
 
 
 def _node_frame(asset: Asset) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """The rotation that makes the user's axes Y-up, and an offset (in the user's frame) to keep out of float32."""
+    """The rotation that makes the user's axes Y-up, and an offset (in the user's frame) to subtract before float32."""
     linear = asset.source.work_from_user[:3, :3]
     # Rounded, since turns between axes are exact and the scale leaves noise in the last digits.
     rotation = np.round(linear / np.cbrt(np.linalg.det(linear)), 12) + 0.0
@@ -100,23 +100,28 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
 def _objects(asset: Asset) -> tuple[Int[np.ndarray, " f"], list[str]]:
     """The object of every face, by number, and the objects' names; the asset's name where the source has none."""
     numbers: dict[str, int] = {}
-    thing = np.zeros(len(asset.mesh.faces), np.int32)
+    object_of_face = np.zeros(len(asset.mesh.faces), np.int32)
     for p in asset.source.primitives:
-        thing[p.start : p.stop] = numbers.setdefault(p.name or asset.name, len(numbers))
-    return thing, list(numbers) or [asset.name]
+        object_of_face[p.start : p.stop] = numbers.setdefault(p.name or asset.name, len(numbers))
+    return object_of_face, list(numbers) or [asset.name]
 
 
 def _primitives(
-    builder: Builder, asset: Asset, part: int, thing: Int[np.ndarray, " f"], rotation: np.ndarray, offset: np.ndarray
+    builder: Builder,
+    asset: Asset,
+    part: int,
+    object_of_face: Int[np.ndarray, " f"],
+    rotation: np.ndarray,
+    offset: np.ndarray,
 ) -> list[tuple[int, Tree]]:
-    """The faces of a part, object by object. Tangents are those of the part as a whole, as its normal map has them."""
+    """The faces of a part, object by object. Tangents are computed for the whole part, as in its normal map."""
     welded = weld(asset.mesh, part)
     positions = (asset.source.user_positions[welded.vertex] - offset).astype(np.float32)
     normals = unit_normals(welded.normals if np.array_equal(rotation, np.eye(3)) else welded.normals @ rotation)
     uvs = np.stack([welded.uvs[:, 0], 1 - welded.uvs[:, 1]], axis=1)
-    # -v instead of v = 1 - v': tangents depend on differences only, and those of the file's own numbers decide.
+    # -v instead of v = 1 - v': tangents depend on differences only, and those of the file's own numbers are exact.
     tangents = mikktspace(positions, normals, uvs * np.array([1, -1], np.float32), welded.faces)
-    owner = thing[asset.mesh.part == part]
+    owner = object_of_face[asset.mesh.part == part]
     result = []
     for k in np.unique(owner).tolist():
         rows = np.flatnonzero(owner == k)
@@ -148,7 +153,7 @@ def _material(asset: Asset, part: int, textures: dict[str, int]) -> Tree:
     faces = asset.mesh.faces[asset.mesh.part == part]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     if (np.bincount(distinct(edges)[1]) == 1).any():
-        material["doubleSided"] = True  # an open surface is seen from behind as well, as its renders here show it
+        material["doubleSided"] = True  # an open surface is visible from behind, also in our renders
     return material
 
 

@@ -1,4 +1,4 @@
-"""OpenEXR and Radiance files, header first."""
+"""Reader of OpenEXR and Radiance files, header first."""
 
 import re
 import sys
@@ -32,8 +32,8 @@ def read_exr(path: Path) -> dict[str, Shaped[np.ndarray, "h w"]]:
 
 
 def colour_of_exr(path: Path) -> Float[np.ndarray, "h w 3"]:
-    """The picture in a file that serves as a texture: R, G and B, of a layer where they stand in one (the first by
-    name), else its first channel three times. NaN and infinities are 0."""
+    """The picture in a file that serves as a texture: R, G and B, also of a layer (the first by name), else its first
+    channel three times. NaN and infinities are 0."""
     planes = read_exr(path)
     layers = sorted(name[:-1] for name in planes if name.endswith("R"))
     layer = next((x for x in layers if {f"{x}G", f"{x}B"} <= set(planes)), None)
@@ -49,7 +49,7 @@ def size_of_exr(path: Path) -> tuple[int, int]:
 
 
 def parts_of_exr(path: Path) -> list[Any]:
-    """The decoded parts of a file whose headers have passed; every part that the file announces is there."""
+    """The decoded parts of a file whose headers have passed; no announced part is missing."""
     import OpenEXR
 
     if read_bytes(path, count=4) != EXR_MAGIC:
@@ -68,7 +68,7 @@ def parts_of_exr(path: Path) -> list[Any]:
 
 
 def headers_of_exr(path: Path) -> list[dict[str, Any]]:
-    """The headers of all parts, checked before anything is decoded."""
+    """The headers of all parts, checked before decoding."""
     import OpenEXR
 
     try:
@@ -109,7 +109,7 @@ def check_headers(headers: list[dict[str, Any]], path: Path) -> None:
 
 
 def _shown(pixels: Shaped[np.ndarray, "h w"], header: dict[str, Any], path: Path) -> Shaped[np.ndarray, "h2 w2"]:
-    """The display window: zero where there are no data."""
+    """The pixels of the display window, zero outside the data window."""
     x, y, width, height = window_of(header, "dataWindow")
     sx, sy, shown_width, shown_height = window_of(header, "displayWindow")
     if pixels.shape != (height, width):
@@ -147,12 +147,12 @@ def _rgbe(path: Path, data: bytes) -> Any:
     import cv2
 
     try:
-        # OpenCV decodes Radiance from files only: given bytes it writes them to a file of its own first, which the
-        # reader process may not do. On Windows it takes no path beyond ASCII.
-        straight = sys.platform != "win32" or str(path).isascii()
+        # OpenCV decodes Radiance from files only: it writes bytes to a temporary file first, which the
+        # reader process may not do. On Windows it accepts only ASCII paths.
+        from_file = sys.platform != "win32" or str(path).isascii()
         return (
             cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            if straight
+            if from_file
             else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         )
     except cv2.error as error:
@@ -160,7 +160,7 @@ def _rgbe(path: Path, data: bytes) -> Any:
 
 
 def _xyze(data: bytes, at: int, height: int, width: int, path: Path) -> Float[np.ndarray, "h w 3"]:
-    """CIE XYZ with a common exponent (which OpenCV does not read) as linear Rec.709; what lies outside it is 0."""
+    """CIE XYZ with a common exponent (which OpenCV does not read) as linear Rec.709; colours outside it become 0."""
     quads = np.empty((height, width, 4), np.uint8)
     try:
         for row in quads:
@@ -173,8 +173,8 @@ def _xyze(data: bytes, at: int, height: int, width: int, path: Path) -> Float[np
 
 
 def _scanline(data: bytes, at: int, row: Shaped[np.ndarray, "w 4"]) -> int:
-    """Fill one row of a Radiance picture, plain or run-length encoded by component; where the next one begins. Raises
-    IndexError or ValueError where the data end or do not fit."""
+    """Fill one row of a Radiance picture, plain or run-length encoded by component; returns the next row's offset.
+    Raises IndexError or ValueError for truncated or invalid data."""
     width = len(row)
     if not (8 <= width < 32768 and data[at] == data[at + 1] == 2 and data[at + 2] < 128):
         row[:] = np.frombuffer(data, np.uint8, 4 * width, at).reshape(width, 4)

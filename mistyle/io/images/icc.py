@@ -1,6 +1,6 @@
-"""Embedded colour profiles of matrix and curves (ICC.1:2022), in floats: what 16-bit pictures need.
+"""Embedded matrix and curve colour profiles (ICC.1:2022) in floats, for 16-bit pictures.
 
-Pillow's colour management knows 8 bits only. Profiles of tables (A2B0) are not read here.
+Pillow's colour management supports 8 bits only. Profiles with tables (A2B0) are not read here.
 """
 
 import struct
@@ -64,8 +64,10 @@ def _curve(tag: bytes) -> Float[np.ndarray, " n"] | tuple[float, ...]:
     (kind,) = struct.unpack_from(">H", tag, 8)
     if kind > 4:
         raise Unusable("a curve of an unknown kind")
-    given = [x / 65536 for x in struct.unpack_from(f">{(1, 3, 4, 5, 7)[kind]}i", tag, 12)]
-    g, a, b, c, d, e, f = (*given, 1.0, 0.0)[:3] + (0.0,) * 4 if kind == 0 else (*given, *[0.0] * (7 - len(given)))
+    parameters = [x / 65536 for x in struct.unpack_from(f">{(1, 3, 4, 5, 7)[kind]}i", tag, 12)]
+    g, a, b, c, d, e, f = (
+        (*parameters, 1.0, 0.0)[:3] + (0.0,) * 4 if kind == 0 else (*parameters, *[0.0] * (7 - len(parameters)))
+    )
     if kind in (1, 2):  # constant below -b/a: 0, or c
         low = c if kind == 2 else 0.0
         return (g, a, b, 0.0, -b / a if a else 0.0, low, low)
@@ -80,8 +82,8 @@ def _linear(values: Float[np.ndarray, " n"], curve: Float[np.ndarray, " n"] | tu
 
 
 def to_srgb(pixels: Shaped[np.ndarray, "h w 3"], profile: Profile, grey: bool) -> Shaped[np.ndarray, "h w 3"]:
-    """Whole numbers of a picture in its profile's colours as sRGB of the same kind; colours beyond it are clipped.
-    Raises Unusable where one is `grey` and the other is not."""
+    """Integer pixels in the profile's colours as sRGB of the same type; colours outside sRGB are clipped. Raises
+    Unusable where `grey` does not match the profile."""
     if grey != (profile.colorants is None):
         raise Unusable("it is for pixels of another kind")
     top = np.iinfo(pixels.dtype).max

@@ -1,7 +1,7 @@
-"""Pictures as layers for comparing: every AOV of a multi-layer or multi-part EXR by its name, or one plain picture.
+"""Pictures as layers for comparison: every AOV of a multi-layer or multi-part EXR by its name, or one plain picture.
 
-Colours are linear Rec.709 as stored, premultiplied by alpha (EXR is; PNG and its like are straight and are multiplied
-here, in linear light). Nothing is resampled, tone-mapped or clipped, and NaN and infinities stay.
+Colours are linear Rec.709 as stored, premultiplied by alpha (EXR is; PNG and similar formats are straight and are
+multiplied here, in linear light). Nothing is resampled, tone-mapped or clipped, and NaN and infinities stay.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from mistyle.io.images.quantisation import linear_rows
 from mistyle.io.sandbox.bounds import refuse
 
 BEAUTY = "beauty"
-# Names that renderers give the finished picture: it is matched across them as one layer.
+# Renderers' names of the finished picture, which is matched across renderers as one layer.
 BEAUTY_NAMES = {"", "beauty", "combined", "rgba", "rgb", "color", "colour", "composite"}
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 AGAIN = "Write or copy it again"
@@ -30,7 +30,7 @@ class Layer:
 
     kind     "colour" (red, green, blue) or "data" (everything else: alpha, depth, normals, ids)
     window   x, y, width, height of the planes in the frame's pixel coordinates
-    display  the display window that frames are compared in
+    display  the display window, in which frames are compared
     """
 
     name: str
@@ -65,8 +65,8 @@ class Layer:
 
 @dataclass(frozen=True)
 class LayeredPicture:
-    """A picture file. `high` where its values are not bounded by 1 (EXR, HDR); `chromaticities` as its header has them
-    (Rec.709 where it has none)."""
+    """A picture file. `high`: its values are not bounded by 1 (EXR, HDR). `chromaticities` are its header's (Rec.709
+    without an entry)."""
 
     path: Path
     layers: tuple[Layer, ...]
@@ -75,7 +75,7 @@ class LayeredPicture:
     notes: tuple[str, ...] = ()
 
     def layer(self, name: str) -> Layer | None:
-        """The layer of that name (upper and lower case alike), or None."""
+        """The layer of that name (ignoring case), or None."""
         return next((layer for layer in self.layers if layer.name.casefold() == name.casefold()), None)
 
 
@@ -114,23 +114,23 @@ def _read_exr(path: Path) -> LayeredPicture:
     beauty = next((name for name, *_ in groups if name.rpartition(".")[2].casefold() in BEAUTY_NAMES), None)
     layers = [layer for group in groups for layer in _split(*group, group[0] == beauty)]
     names = [layer.name.casefold() for layer in layers]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise refuse(path, f"two layers called {twice[0]!r}", "names that tell layers apart", "Rename one of them")
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise refuse(path, f"two layers called {duplicates[0]!r}", "names that tell layers apart", "Rename one of them")
     return LayeredPicture(path, tuple(layers), True, _chromaticities(parts[0].header, path))
 
 
 def _groups(part: Any, several: bool, path: Path) -> list[tuple[str, dict[str, np.ndarray], Window, Window]]:
     """A part's channels by layer: the layer's full name, its planes by short name, data and display window."""
     window, display = hdr.window_of(part.header, "dataWindow"), hdr.window_of(part.header, "displayWindow")
-    called = str(part.header.get("name") or "") if several else ""
+    part_name = str(part.header.get("name") or "") if several else ""
     groups: dict[str, dict[str, np.ndarray]] = {}
     for name, channel in part.channels.items():
         pixels = np.asarray(channel.pixels)
         if pixels.shape != (window[3], window[2]):
             raise refuse(path, f"{pixels.shape} texels", f"{(window[3], window[2])} by its header", AGAIN)
         layer, _, short = name.rpartition(".")
-        groups.setdefault(_full(called, layer), {})[short] = pixels
+        groups.setdefault(_full(part_name, layer), {})[short] = pixels
     return [(name, planes, window, display) for name, planes in groups.items()]
 
 
@@ -142,16 +142,16 @@ def _full(part: str, layer: str) -> str:
 
 
 def _split(name: str, planes: dict[str, np.ndarray], window: Window, display: Window, beauty: bool) -> list[Layer]:
-    """Colour, alpha and the rest of a group of channels."""
-    shown = BEAUTY if beauty else name
+    """The colour, alpha and data layers of a group of channels."""
+    title = BEAUTY if beauty else name
     upper = {channel.upper(): channel for channel in planes}
     result = []
     if set("RGB") <= set(upper):
         used = tuple(upper[c] for c in "RGB")
-        result.append(Layer(shown, tuple("RGB"), tuple(planes[c] for c in used), "colour", window, display))
+        result.append(Layer(title, tuple("RGB"), tuple(planes[c] for c in used), "colour", window, display))
     elif beauty and "Y" in upper and "X" not in upper:
         used = (upper["Y"],)
-        result.append(Layer(shown, tuple("RGB"), (planes[used[0]],) * 3, "colour", window, display))
+        result.append(Layer(title, tuple("RGB"), (planes[used[0]],) * 3, "colour", window, display))
     else:
         used = ()
     rest = {c: p for c, p in planes.items() if c not in used}
@@ -159,17 +159,17 @@ def _split(name: str, planes: dict[str, np.ndarray], window: Window, display: Wi
         order = sorted(rest)
         return [Layer(name or "data", tuple(order), tuple(rest[c] for c in order), "data", window, display)]
     for channel, plane in rest.items():
-        called = "alpha" if beauty and channel.upper() == "A" else f"{name}.{channel}" if name else channel
-        result.append(Layer(called, (channel,), (plane,), "data", window, display))
+        layer_name = "alpha" if beauty and channel.upper() == "A" else f"{name}.{channel}" if name else channel
+        result.append(Layer(layer_name, (channel,), (plane,), "data", window, display))
     return result
 
 
 def _chromaticities(header: dict[str, Any], path: Path) -> tuple[float, ...]:
-    found = header.get("chromaticities")
-    if found is None:
+    entry = header.get("chromaticities")
+    if entry is None:
         return REC709
     try:
-        values = tuple(float(v) for pair in found for v in (pair if np.ndim(pair) else [pair]))
+        values = tuple(float(v) for pair in entry for v in (pair if np.ndim(pair) else [pair]))
     except (TypeError, ValueError) as error:
-        raise refuse(path, f"chromaticities of type {type(found).__name__}", "eight numbers", AGAIN) from error
+        raise refuse(path, f"chromaticities of type {type(entry).__name__}", "eight numbers", AGAIN) from error
     return values if len(values) == 8 else REC709

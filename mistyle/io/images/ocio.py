@@ -1,9 +1,9 @@
-"""Colour spaces of an OpenColorIO config at the edges of a job; inside everything is linear Rec.709 (D65).
+"""OpenColorIO colour spaces for input and output; the pipeline works in linear Rec.709 (D65).
 
-Needs the extra `ocio` (opencolorio) only where a space is named. The config is the one that is asked for, else the
-default that opencolorio brings along; between it and the working space lies an interchange role, which every ACES
-config has. EXR files are tagged with the Color Interop Forum's identifier of the space where it has one (found by what
-the space does, whatever the config calls it), and with that space's own chromaticities.
+Needs the extra `ocio` (opencolorio) only where a space is named. The config is the requested one, else opencolorio's
+default. An interchange role, which every ACES config has, connects it with the working space. EXR files are tagged with
+the Color Interop Forum's identifier of the space, if any, and with that space's own chromaticities. The identifier
+follows from the transform, not from the config's name of the space.
 """
 
 import difflib
@@ -36,7 +36,7 @@ Pixels = Float[np.ndarray, "*n 3"]
 class ColourSpace:
     """A space by its name in `config`: `to_working` takes its values to linear Rec.709, `from_working` back.
 
-    interop  the Color Interop Forum's identifier, "" where it has none that is known here
+    interop  the Color Interop Forum's identifier, "" where it has no known one
     """
 
     name: str
@@ -56,10 +56,10 @@ def library() -> Any:
 
 
 def colour_space(name: str, config: str | None = None, *, linear: bool = True) -> ColourSpace:
-    """The space that `name` (or an alias or a role) means in a config: a file, or ocio://…; None: opencolorio's own.
+    """The space `name` (or an alias or a role) of a config: a file, or ocio://…; None: opencolorio's own.
 
     With `linear` a space that is not scene-linear is refused, since EXR textures hold light. Raises UsageError with the
-    nearest names, EnvironmentMissing.
+    nearest names, or EnvironmentMissing.
     """
     ocio = library()
     where = config or DEFAULT
@@ -72,15 +72,15 @@ def colour_space(name: str, config: str | None = None, *, linear: bool = True) -
     if linear and not opened.isColorSpaceLinear(space.getName(), space.getReferenceSpaceType()):
         raise UsageError(f"--colorspace {name!r}: it is not linear, and EXR textures hold light; {_near('', opened)}")
     try:
-        to = _processor(ocio, opened, space.getName(), _opened(WORKING[0]), WORKING[1])
-        back = _processor(ocio, _opened(WORKING[0]), WORKING[1], opened, space.getName())
+        to_working = _processor(ocio, opened, space.getName(), _opened(WORKING[0]), WORKING[1])
+        from_working = _processor(ocio, _opened(WORKING[0]), WORKING[1], opened, space.getName())
     except ocio.Exception as error:
-        said = str(error).split("\n")[0][:200]
+        message = str(error).split("\n")[0][:200]
         raise UsageError(
-            f"--colorspace {name!r}: {where} does not relate its colours to other spaces ({said}); it needs the role "
-            "aces_interchange, as the ACES configs have it"
+            f"--colorspace {name!r}: {where} does not relate its colours to other spaces ({message}); it needs the "
+            "role aces_interchange, which the ACES configs have"
         ) from None
-    return ColourSpace(space.getName(), where, _interop(to) if linear else "", to, back)
+    return ColourSpace(space.getName(), where, _interop(to_working) if linear else "", to_working, from_working)
 
 
 @cache
@@ -89,13 +89,13 @@ def _opened(where: str) -> Any:
     try:
         return ocio.Config.CreateFromFile(where)
     except (ocio.Exception, ocio.ExceptionMissingFile) as error:
-        said = str(error).split("\n")[0][:200]
-        raise UsageError(f"{where}: not an OpenColorIO config ({said}); check $OCIO or colour.config") from None
+        message = str(error).split("\n")[0][:200]
+        raise UsageError(f"{where}: not an OpenColorIO config ({message}); check $OCIO or colour.config") from None
 
 
-def _processor(ocio: Any, source: Any, name: str, target: Any, other: str) -> Callable[[Pixels], Pixels]:
-    found = ocio.Config.GetProcessorFromConfigs(source, name, target, other)
-    exact = found.getOptimizedCPUProcessor(ocio.OPTIMIZATION_LOSSLESS)
+def _processor(ocio: Any, source: Any, name: str, target: Any, target_name: str) -> Callable[[Pixels], Pixels]:
+    processor = ocio.Config.GetProcessorFromConfigs(source, name, target, target_name)
+    exact = processor.getOptimizedCPUProcessor(ocio.OPTIMIZATION_LOSSLESS)
 
     def apply(rgb: Pixels) -> Pixels:
         flat = np.array(rgb, np.float32, order="C").reshape(-1, 3)
@@ -106,19 +106,19 @@ def _processor(ocio: Any, source: Any, name: str, target: Any, other: str) -> Ca
 
 
 def _interop(to_working: Callable[[Pixels], Pixels]) -> str:
-    """The known space that does the same to red, green and blue."""
+    """The identifier of the known space with the same transform of red, green and blue; "" without one."""
     ocio, basis = library(), np.eye(3, dtype=np.float32)
     own = to_working(basis)
     home = _opened(WORKING[0])
     for identifier, (name, _) in KNOWN.items():
-        other = _processor(ocio, home, name, home, WORKING[1])(basis)
-        if np.abs(own - other).max() < 1e-3:
+        candidate = _processor(ocio, home, name, home, WORKING[1])(basis)
+        if np.abs(own - candidate).max() < 1e-3:
             return identifier
     return ""
 
 
 def _near(name: str, config: Any) -> str:
-    """Names worth trying: those that look like `name`, else the linear ones."""
+    """Suggested names: those similar to `name`, else the linear ones."""
     spaces = [config.getColorSpace(n) for n in config.getColorSpaceNames()]
     known = {alias.lower(): s.getName() for s in spaces for alias in [s.getName(), *s.getAliases()]}
     close = difflib.get_close_matches(name.lower(), list(known), n=6, cutoff=0.45) if name else []
@@ -131,8 +131,8 @@ def _near(name: str, config: Any) -> str:
 
 
 def exr_tags(space: ColourSpace | None) -> dict[str, Any]:
-    """What an EXR in this space (None: linear Rec.709) says of its colours; the space's own name where no standard
-    identifier is known, and then no chromaticities, which would be a guess."""
+    """Colour attributes of an EXR in this space (None: linear Rec.709). Without a standard identifier they are the
+    space's own name and no chromaticities, which are unknown."""
     if space is None or space.interop == LINEAR_REC709:
         return {"colorInteropID": LINEAR_REC709, "chromaticities": REC709_CHROMATICITIES}
     if space.interop:
@@ -141,7 +141,7 @@ def exr_tags(space: ColourSpace | None) -> dict[str, Any]:
 
 
 def materialx_space(space: ColourSpace | None) -> str:
-    """The space as MaterialX and OpenColorIO's aliases spell it."""
+    """The space's name in MaterialX and in OpenColorIO's aliases."""
     if space is None:
         return "lin_rec709"
     return space.interop.removesuffix("_scene") if space.interop else space.name

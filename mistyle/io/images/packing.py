@@ -1,8 +1,8 @@
-"""Maps as the texture files that a program wants: which channels lie together, how normals point, how many bits.
+"""Packing of maps into the texture files of a target program: channels, normal convention, bit depth.
 
-What stands in a file follows the program's own documentation: glTF and Unreal pack occlusion, roughness and metallic
-(Unreal's normals are DirectX's, green down), Unity stores smoothness = 1 - roughness in alpha, beside metallic (URP)
-or in a mask map of metallic, occlusion, detail, smoothness (HDRP); film renderers read one float EXR a map.
+The layout follows each program's own documentation: glTF and Unreal pack occlusion, roughness and metallic
+(Unreal's normals are DirectX's, green down). Unity stores smoothness = 1 - roughness in alpha, beside metallic (URP) or
+in a mask map of metallic, occlusion, detail, smoothness (HDRP). Film renderers read one float EXR a map.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ Image = Float[np.ndarray, "h w"] | Float[np.ndarray, "h w c"]
 
 @dataclass(frozen=True)
 class TextureSet:
-    """The finished maps of one texture set, row 0 = v 1; `tile` is its UDIM tile (1001 where there is one only).
+    """The finished maps of one texture set, row 0 = v 1; `tile` is its UDIM tile (1001 for a single tile).
 
     albedo linear Rec.709; normal encoded (n + 1) / 2, +Y; roughness, metallic and occlusion 0..1; alpha or None
     """
@@ -39,7 +39,7 @@ class TextureSet:
 
 @dataclass(frozen=True)
 class Slot:
-    """One texture file: `map` is its name's last word, `colour` how its values are to be read."""
+    """One texture file: `map` is its name's suffix, `colour` the encoding of its values."""
 
     map: str
     pixels: Callable[[TextureSet], Image]
@@ -50,7 +50,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class Target:
-    """What a program wants; `normal` is "+Y" (OpenGL) or "-Y" (DirectX)."""
+    """The texture files of a program; `normal` is "+Y" (OpenGL) or "-Y" (DirectX)."""
 
     slots: tuple[Slot, ...]
     normal: Literal["+Y", "-Y"]
@@ -122,7 +122,7 @@ TARGETS = {
 
 
 def write_slot(path: Path, slot: Slot, textures: TextureSet, space: ColourSpace | None = None) -> None:
-    """Write one texture file; colours that are stored as light are converted to `space` and tagged as such."""
+    """Write one texture file; linear colours are converted to `space` and tagged as such."""
     pixels = slot.pixels(textures)
     if slot.colour == "linear" and space is not None:
         pixels = np.concatenate([space.from_working(pixels[..., :3]), pixels[..., 3:]], axis=-1)

@@ -1,5 +1,5 @@
-"""From the whole numbers that pictures hold to the floats that materials have. Plain arithmetic: the reader process
-sends the numbers, which are a quarter of the bytes, and the job's own process makes the floats."""
+"""Conversion of integer pixels to the float values of materials. The reader process sends integers, a quarter of the
+bytes, and the job's own process converts them."""
 
 from typing import Literal
 
@@ -12,7 +12,7 @@ Kind = Literal["colour", "normal", "data"]
 
 
 def fractions(pixels: Shaped[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """8- or 16-bit numbers as float32 0..1; floats as they are."""
+    """8- or 16-bit integers as float32 0..1; floats stay."""
     if pixels.dtype.kind == "f":
         return pixels
     return np.divide(pixels, np.float32(np.iinfo(pixels.dtype).max), dtype=np.float32)
@@ -32,7 +32,7 @@ def finished(
 
 
 def linear_rows(encoded: Shaped[np.ndarray, "h w *c"]) -> Float[np.ndarray, "h w *c"]:
-    """sRGB to linear in rows, so that the powers' temporaries stay small."""
+    """sRGB to linear by blocks of rows, to bound the temporary memory."""
     result = np.empty(encoded.shape, np.float32)
     for start in range(0, len(encoded), 256):
         result[start : start + 256] = linear_from_srgb(fractions(encoded[start : start + 256]))

@@ -1,4 +1,4 @@
-"""Pictures and textures: headers first, sizes bounded, everything turned into plain float arrays."""
+"""Decoder of pictures and textures: headers first, sizes bounded, plain arrays as results."""
 
 import io
 import warnings
@@ -22,18 +22,18 @@ CONVERT = "Save it as PNG or JPEG and try again"
 MAX_PICTURE_BYTES = 512 << 20
 ORIENTATION = 0x0112  # the tag of EXIF and TIFF: 1 upright, 2 mirrored, 3 turned by 180 degrees, ... 8
 BITS_PER_SAMPLE, PLANES, EXTRA_SAMPLES, ASSOCIATED = 258, 284, 338, 1  # TIFF 6.0; 1: colours are multiplied by alpha
-UNDONE_BY = {6: 8, 8: 6}  # the other orientations undo themselves
+UNDONE_BY = {6: 8, 8: 6}  # the other orientations are their own inverses
 
 
 @dataclass
 class Budget:
-    """How many texels the textures of one mesh have used up (state: it outlives every decode)."""
+    """Number of texels that the textures of one mesh have used (state across all decodes)."""
 
     path: Path
     pixels: int = 0
 
     def take(self, pixels: int) -> None:
-        """Count, and refuse when the mesh's textures get too many together."""
+        """Add `pixels`; refuse when the mesh's textures exceed the limit together."""
         self.pixels += pixels
         if self.pixels > MAX_TEXTURE_PIXELS:
             found, most = (
@@ -46,10 +46,10 @@ class Budget:
 def read_pixels(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
     """A style or any other picture file as sRGB-encoded 8- or 16-bit rgb (h w 3) and alpha (h w), and notes.
 
-    Size is checked in the header before anything is decoded (at most MAX_PIXELS). Embedded colour profiles are
-    converted to sRGB, EXIF orientation is applied (with `pixels` "stored" it is not), CMYK, palettes, grey and 16-bit
-    files are converted, of several pictures the first is taken; `notes` says so. Refused with a sentence: files that
-    are no picture of a known format (SVG and PDF among them), cut-off or damaged ones, ones of no or too many pixels.
+    Size is checked in the header before decoding (at most MAX_PIXELS). Embedded colour profiles are converted to sRGB,
+    EXIF orientation is applied (not with `pixels` "stored"), CMYK, palettes, grey and 16-bit files are converted. The
+    first of several pictures is read. `notes` lists the conversions. InputRefused for files that are not pictures of a
+    known format (such as SVG and PDF), for truncated or damaged files, and for no or too many pixels.
     """
     path = Path(path)
     data = read_bytes(path, MAX_PICTURE_BYTES)
@@ -61,14 +61,14 @@ def read_pixels(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.
         notes.append("The picture was turned upright by its EXIF orientation.")
     rgb, alpha = _pixels(image, data, str(path), notes)
     rgb, alpha = (
-        None if part is None else _as_wanted(part, orientation, image.format == "TIFF", pixels) for part in (rgb, alpha)
+        None if part is None else _oriented(part, orientation, image.format == "TIFF", pixels) for part in (rgb, alpha)
     )
     assert rgb is not None
     return rgb, alpha, tuple(notes)
 
 
 def picture_of(path: Path, pixels: tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]) -> Picture:
-    """What `read_pixels` gave, as floats."""
+    """The result of `read_pixels` as floats."""
     rgb, alpha, notes = pixels
     return Picture(fractions(rgb), None if alpha is None else fractions(alpha), path, notes)
 
@@ -93,8 +93,8 @@ def texture(data: bytes, where: str, budget: Budget) -> Shaped[np.ndarray, "h w 
 
 
 def texture_file(path: Path, budget: Budget) -> tuple[Shaped[np.ndarray, "h w 3"], bool]:
-    """A mesh's texture in a file of its own, and whether its values are linear: EXR and Radiance files' are, in floats
-    without bounds; a single channel counts for all three."""
+    """A mesh's texture in a file of its own, and whether its values are linear: those of EXR and
+    Radiance files are, in unbounded floats. A single channel is repeated three times."""
     from mistyle.io.images import hdr
 
     head = read_bytes(path, count=10)
@@ -112,21 +112,20 @@ def texture_file(path: Path, budget: Budget) -> tuple[Shaped[np.ndarray, "h w 3"
 def named_texture(
     where: Path, roots: Sequence[Path], name: str, budget: Budget, notes: list[str]
 ) -> tuple[Shaped[np.ndarray, "h w 3"], bool] | None:
-    """The `texture_file` that the file `where` names, relative to one of `roots` or found near them
-    (io/sandbox/nearby.py);
-    None, with a note, where there is none that can be used."""
+    """The `texture_file` that the file `where` names, relative to one of `roots` or near them (io/sandbox/nearby.py);
+    None, with a note, without a usable file."""
     try:
         target, place = named_file(where, roots, name)
         if target is None:
             notes.append(f"Texture {name} is not there and was left out.")
             return None
-        found = texture_file(target, budget)
+        pixels = texture_file(target, budget)
     except InputRefused as error:
         notes.append(f"Texture {name} was left out: {error}")
         return None
     if place is not None:
         notes.append(f"Texture {name} was found by its name at {place}.")
-    return found
+    return pixels
 
 
 def decode(data: bytes, where: str, budget: Budget, kind: Kind, scale: float = 1.0) -> Float[np.ndarray, "h w 3"]:
@@ -155,7 +154,7 @@ def shrunk(data: bytes, where: str, longest: int, quality: int) -> tuple[bytes, 
 
 
 def alpha_of(data: bytes, where: str) -> Float[np.ndarray, "h w"] | None:
-    """The alpha 0..1 of a texture; None where it has none, is opaque, or is no picture at all."""
+    """The alpha 0..1 of a texture; None where it has none, is opaque, or is not a picture."""
     try:
         image, _ = _open(data, where)
         if not image.has_transparency_data:
@@ -168,7 +167,7 @@ def alpha_of(data: bytes, where: str) -> Float[np.ndarray, "h w"] | None:
 
 
 def alpha_map(data: bytes, where: str) -> Float[np.ndarray, "h w"]:
-    """A map that is the alpha 0..1 of a texture: 1 everywhere where it has none."""
+    """The alpha 0..1 of a texture as a map: 1 everywhere where it has none."""
     alpha = alpha_of(data, where)
     return np.ones((2, 2), np.float32) if alpha is None else alpha
 
@@ -197,19 +196,21 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(io.BytesIO(data), formats=[f for f in FORMATS if f in Image.OPEN])
-            several = bool(getattr(image, "is_animated", False))  # to count the frames may take minutes
+            several = bool(getattr(image, "is_animated", False))  # counting the frames may take minutes
     except Image.DecompressionBombError as error:
         raise _too_large(where, "far too many pixels") from error
     except (OSError, ValueError, SyntaxError, EOFError, OverflowError, KeyError, TypeError) as error:
-        # Pillow's own words for an unknown format name only the buffer.
+        # Pillow's message for an unknown format names only the buffer.
         why = "" if isinstance(error, Image.UnidentifiedImageError) else f" ({_first(error)})"
         raise refuse(where, f"a file that no decoder takes{why}", EXPECTED, CONVERT) from error
     if image.width < 1 or image.height < 1:
         raise refuse(where, f"{image.width} x {image.height} pixels", "at least one pixel", CONVERT)
     if image.width * image.height > MAX_PIXELS:
         raise _too_large(where, f"{image.width} x {image.height} pixels")
-    taken = {"MPO": "first picture of the MPO file", "TIFF": "first page"}
-    notes = [f"Only the {taken.get(str(image.format), 'first frame of the animation')} was read."] if several else []
+    first_parts = {"MPO": "first picture of the MPO file", "TIFF": "first page"}
+    notes = (
+        [f"Only the {first_parts.get(str(image.format), 'first frame of the animation')} was read."] if several else []
+    )
     return image, notes
 
 
@@ -218,7 +219,7 @@ def _too_large(where: str, found: str) -> InputRefused:
 
 
 def _load(image: Any, where: str) -> None:
-    """Decode; a cut-off or damaged file is refused."""
+    """Decode; a truncated or damaged file is refused."""
     import struct
     import zlib
 
@@ -236,23 +237,23 @@ def _first(error: Exception) -> str:
 def _orientation(image: Any) -> int:
     """The orientation 1..8 of an opened picture; 1 where it has none or its EXIF data cannot be read."""
     try:
-        found = image.getexif().get(ORIENTATION, 1)
+        orientation = image.getexif().get(ORIENTATION, 1)
     except (OSError, ValueError, SyntaxError, KeyError, TypeError):
         return 1
-    return found if isinstance(found, int) and found in range(1, 9) else 1
+    return orientation if isinstance(orientation, int) and orientation in range(1, 9) else 1
 
 
-def _as_wanted(
-    pixels: Shaped[np.ndarray, "h w *c"], orientation: int, upright: bool, wanted: Pixels
+def _oriented(
+    pixels: Shaped[np.ndarray, "h w *c"], orientation: int, upright: bool, requested: Pixels
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """Decoded pixels, which are `upright` already or as stored, as they are `wanted`."""
-    if upright == (wanted == "upright"):
+    """Decoded pixels in the `requested` orientation; `upright` is the state of `pixels`."""
+    if upright == (requested == "upright"):
         return pixels
     return np.ascontiguousarray(_turned(pixels, UNDONE_BY.get(orientation, orientation) if upright else orientation))
 
 
 def _turned(stored: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """The upright picture of stored pixels (EXIF 2.3, tag 0x0112: where row 0 and column 0 are)."""
+    """The upright picture of stored pixels (EXIF 2.3, tag 0x0112: positions of row 0 and column 0)."""
     rows, columns = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (-1, 1), 7: (-1, -1), 8: (1, -1)}[
         orientation
     ]
@@ -263,7 +264,7 @@ def _turned(stored: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np
 def _pixels(
     image: Any, data: bytes, where: str, notes: list[str], managed: bool = True
 ) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None]:
-    """Encoded rgb and alpha (None where opaque), 8 or 16 bits, of a picture in whatever mode."""
+    """Encoded rgb and alpha (None where opaque), 8 or 16 bits, of a picture in any mode."""
     _load(image, where)
     deep = _sixteen_bit(data, image, where, notes)
     if deep is not None:
@@ -310,7 +311,7 @@ def _plain(image: Any, where: str, notes: list[str]) -> tuple[Any, Any | None]:
 
 
 def _to_srgb(image: Any, where: str, notes: list[str]) -> Any:
-    """Convert through the embedded profile; sRGB's own changes nothing, a damaged one is passed over with a note."""
+    """Convert through the embedded profile; sRGB's own changes nothing, a damaged one is ignored with a note."""
     from PIL import ImageCms
 
     data = image.info.get("icc_profile")
@@ -364,8 +365,8 @@ def _converted(name: str) -> str:
 def _sixteen_bit(
     data: bytes, image: Any, where: str, notes: list[str]
 ) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None] | None:
-    """Pictures with 16 bits a channel, which Pillow has as grey only or cuts to 8 bits; None for all others. As Pillow
-    has them: a TIFF upright, a PNG as stored."""
+    """Pictures with 16 bits a channel, which Pillow decodes as grey only or at 8 bits; None for all others. The
+    orientation is Pillow's: a TIFF upright, a PNG as stored."""
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
         grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
         return np.repeat(grey[..., None], 3, axis=2), None
@@ -388,7 +389,7 @@ def _sixteen_bit(
 def _deep_tiff(
     data: bytes, image: Any, where: str, notes: list[str]
 ) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None] | None:
-    """An RGB TIFF of 16 bits a channel; None, with a note, where Pillow's 8 bits must do."""
+    """An RGB TIFF of 16 bits a channel; None, with a note, where only Pillow's 8 bits are available."""
     import cv2
 
     bits = image.tag_v2.get(BITS_PER_SAMPLE, 8)
@@ -399,14 +400,17 @@ def _deep_tiff(
     try:
         known = image.mode in ("RGB", "RGBA")
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if known else None
-    except cv2.error:  # what Pillow could read all the same
+    except cv2.error:  # Pillow may still read it
         pixels = None
     if pixels is not None and pixels.dtype == np.uint16 and pixels.ndim == 3:
         values = np.asarray(pixels, np.uint16)[..., [2, 1, 0, 3][: pixels.shape[2]]]
         multiplied = image.tag_v2.get(EXTRA_SAMPLES) == (ASSOCIATED,)
-        eight, same = np.asarray(image), slice(3 if multiplied else 0, 4)  # Pillow divides colours by alpha itself
-        # Two decoders must agree on the high bytes, and so about which way is up.
-        if values.shape == eight.shape and np.array_equal((values // 256)[..., same], eight[..., same]):
+        eight_bit, compared = (
+            np.asarray(image),
+            slice(3 if multiplied else 0, 4),
+        )  # Pillow divides colours by alpha itself
+        # Both decoders must agree on the high bytes, and so on the orientation.
+        if values.shape == eight_bit.shape and np.array_equal((values // 256)[..., compared], eight_bit[..., compared]):
             return _straight(values, multiplied)
     notes.append("A TIFF with more than 8 bits a channel was read at 8 bits.")
     return None
@@ -415,7 +419,7 @@ def _deep_tiff(
 def _straight(
     values: Shaped[np.ndarray, "h w c"], multiplied: bool
 ) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None]:
-    """Colours and alpha of 16 bits; colours divided by alpha where the file has them multiplied."""
+    """Colours and alpha of 16 bits; premultiplied colours are divided by alpha."""
     if values.shape[2] == 3:
         return values, None
     rgb, alpha = values[..., :3], values[..., 3]

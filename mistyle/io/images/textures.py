@@ -1,4 +1,4 @@
-"""One texture set as the PNG files that glTF wants."""
+"""PNG files of one texture set for glTF."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Pictures:
 
 
 def part_stems(name: str, parts: Sequence[str]) -> list[str]:
-    """How the files of each part begin: `name` for a single part, else `name_part`, all different even without case
+    """File name stems of each part: `name` for a single part, else `name_part`. They are distinct even without case,
     and short enough for every ending (core/names.py)."""
     if len(parts) == 1:
         return [name]
@@ -81,27 +81,27 @@ def add_textures(builder: Builder, pictures: Pictures, stem: str, *, repeat: boo
 
 
 def drop_emission(material: Tree) -> None:
-    """Take the emission out of a material, whose albedo shows it now (gltf_infos.py `shadeless`)."""
+    """Remove a material's emission, which its albedo now contains (io/gltf/infos.py `shadeless`)."""
     for key in ("emissiveTexture", "emissiveFactor"):
         material.pop(key, None)
     drop_extension(material, "KHR_materials_emissive_strength")
 
 
 def drop_extension(item: Tree, name: str) -> Any:
-    """Take an extension out of an object; what it said, or None."""
-    found = item.get("extensions", {})
-    said = found.pop(name, None)
-    if said is not None and not found:
+    """Remove an extension from an object; returns its value, or None."""
+    extensions = item.get("extensions", {})
+    value = extensions.pop(name, None)
+    if value is not None and not extensions:
         del item["extensions"]
-    return said
+    return value
 
 
 def set_textures(material: Tree, textures: dict[str, int], texcoord: int = 0) -> None:
-    """Let a material show the textures in full: factors, normal scale and occlusion strength are 1.
+    """Set a material's textures without scaling: factors, normal scale and occlusion strength are 1.
 
-    One image serves occlusion and metallic-roughness. What else the material says stays; the base colour keeps its
-    alpha factor. Texture transforms of the replaced textures go with them, and so does the older
-    specular-glossiness model, which viewers would prefer to these textures.
+    One image serves occlusion and metallic-roughness. All other properties stay; the base colour keeps its alpha
+    factor. Texture transforms of the replaced textures are removed, and so is the older specular-glossiness model,
+    which viewers would prefer to these textures.
     """
 
     def info(name: str) -> Tree:
@@ -115,6 +115,6 @@ def set_textures(material: Tree, textures: dict[str, int], texcoord: int = 0) ->
     if alpha != 1:
         surface["baseColorFactor"] = [1, 1, 1, alpha]
     for factor in ("metallicFactor", "roughnessFactor"):
-        surface.pop(factor, None)  # 1 is what glTF takes when nothing is said
+        surface.pop(factor, None)  # 1 is glTF's default
     surface |= {"baseColorTexture": info("albedo"), "metallicRoughnessTexture": info("orm")}
     material |= {"normalTexture": info("normal"), "occlusionTexture": info("orm")}

@@ -1,4 +1,4 @@
-"""Writing pictures: PNG with 8 or 16 bits and multi-layer OpenEXR. The same pixels give the same bytes."""
+"""Writer of pictures: PNG with 8 or 16 bits and multi-layer OpenEXR. Equal pixels give equal bytes."""
 
 import io
 from collections.abc import Callable, Mapping
@@ -21,11 +21,10 @@ def encode_png(
     bits: int = 8,
     encode: Callable[[np.ndarray], np.ndarray] = np.asarray,
 ) -> bytes:
-    """The bytes of a PNG of shape (h w), (h w 3) or (h w 4), values 0..1 as they shall stand in the file.
+    """The bytes of a PNG of shape (h w), (h w 3) or (h w 4), values 0..1 in the file's encoding.
 
-    Nothing is colour-converted, unless `encode` does it, which is applied to some rows at a time. Values are clipped
-    and rounded to the nearest step; no time, colour space or other note is stored. Raises ValueError for another
-    shape or NaN.
+    Only `encode`, applied to blocks of rows, may convert colours. Values are clipped and rounded to the nearest step;
+    no time, colour space or other metadata is stored. Raises ValueError for another shape or NaN.
     """
     import cv2
 
@@ -59,11 +58,11 @@ def write_exr(
 ) -> None:
     """Write arrays of one shape (h w) as the channels of an OpenEXR file (one part, ZIP), atomically.
 
-    A dotted name is a channel of a layer ("normal.X"). The values are stored as they are: linear, infinities and NaN
+    A dotted name is a channel of a layer ("normal.X"). The values are stored unchanged: linear, infinities and NaN
     included; `half` stores 16-bit floats (overflow to infinity beyond 65504), else 32-bit ones. A file with red,
     green and blue, in a layer or outside, is tagged as linear Rec.709 (`chromaticities` and `colorInteropID`
     "lin_rec709_scene"), any other as "data". `attributes` adds or replaces header entries; with colorInteropID "data"
-    the chromaticities are left out. Raises ValueError for arrays of other shapes.
+    the chromaticities are omitted. Raises ValueError for arrays of other shapes.
     """
     import OpenEXR
 
@@ -80,7 +79,7 @@ def write_exr(
     kind = np.float16 if half else np.float32
     with np.errstate(over="ignore"):
         pixels = {name: np.ascontiguousarray(channels[name], dtype=kind) for name in sorted(channels)}
-    # Written to memory first: a full disk is then an OSError with its number, not the library's RuntimeError.
+    # Written to memory first: a full disk then raises OSError with errno, not the library's RuntimeError.
     buffer = io.BytesIO()
     with OpenEXR.File(header, pixels) as file:
         file.write(buffer)

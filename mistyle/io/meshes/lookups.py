@@ -1,8 +1,8 @@
-"""Where the maps of a material are looked up, made plain: one set of texture coordinates, textures that repeat.
+"""Resolution of texture transforms, wrap modes and extra UV sets to one UV set with repeating textures.
 
-Formats say more than the working material can: a transform of the texture coordinates, textures that are mirrored or
-clamped outside the unit square, another UV set for one map. It is resolved here, once, so that all that follows reads
-the material at `Mesh.corner_uvs` modulo 1 and knows nothing of it.
+Formats allow more than the working material: texture transforms, textures that are mirrored or clamped outside the unit
+square, another UV set for one map. They are resolved here, so that later stages read the material at `Mesh.corner_uvs`
+modulo 1.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from mistyle.geometry.retexture import REPEAT, Wrap, Wraps, wrapped
 from mistyle.io.meshes.parsed_mesh import Maps, Raw, RawMap, RawMaterial
 from mistyle.io.sandbox.bounds import WORK_TEXTURE
 
-# UVs that leave the unit square by less show nothing of what lies outside.
+# UVs that leave the unit square by less do not show the outside.
 OUTSIDE = 1e-3
 FARTHEST = 1e4  # tiles
 ORDER = ("albedo", "roughness", "metallic", "normal")
@@ -27,7 +27,7 @@ SQUARE: Spans = ((0.0, 1.0), (0.0, 1.0))
 
 @dataclass(frozen=True)
 class _Plain:
-    """How a material's first map was looked up, and the part of its plane that is one tile of the plain texture."""
+    """The lookup of a material's first map, and the part of its plane that becomes one tile of the plain texture."""
 
     base: RawMap
     wrap: Wraps
@@ -37,9 +37,9 @@ class _Plain:
 def plain_lookups(raw: Raw) -> Raw:
     """The mesh with UVs at which its materials' base maps repeat: transforms applied, other wrap modes unrolled.
 
-    A material's base map is its albedo, or the first map that it has. Maps that are looked up like the base map stay
-    texel by texel; the others keep their own lookup, which `_placed` in io/meshes/prepare.py resamples. Materials of
-    UDIM tiles, whose UVs say which texture is meant, are left alone.
+    A material's base map is its albedo, or the first map that it has. Maps with the base map's lookup keep
+    their texels; the others keep their own lookup, which `_placed` in io/meshes/prepare.py resamples. Materials of UDIM
+    tiles, whose UVs select the texture, stay unchanged.
     """
     uvs, materials, notes = raw.uvs, list(raw.materials), list(raw.notes)
     for m, material in enumerate(raw.materials):
@@ -50,7 +50,7 @@ def plain_lookups(raw: Raw) -> Raw:
             continue
         lookup = looked_up(base, raw.uvs, rows)
         if lookup is not None and not np.nanmax(np.abs(lookup)) < FARTHEST:
-            continue  # nothing to paint there; the maps are resampled from wherever that is
+            continue  # too far to unroll; the maps are resampled from their own lookup
         wrap = REPEAT if lookup is None else effective(base.wrap, lookup)
         if lookup is None or (base.uvs is None and base.transform is None and wrap == REPEAT):
             continue
@@ -71,7 +71,7 @@ def plain_lookups(raw: Raw) -> Raw:
 def looked_up(
     entry: RawMap, uvs: Float[np.ndarray, "f 3 2"] | None, rows: np.ndarray
 ) -> Float[np.ndarray, "n 3 2"] | None:
-    """Where a map is looked up on the faces `rows`: v up, transform applied, NaN where a face has no UVs; None where
+    """Lookup coordinates of a map on the faces `rows`: v up, transform applied, NaN where a face has no UVs; None where
     none has. `uvs` are those of the mesh."""
     own = uvs if entry.uvs is None else entry.uvs
     if own is None or not np.isfinite(own[rows]).any():
@@ -83,19 +83,18 @@ def looked_up(
 
 
 def effective(wrap: Wraps, lookup: Float[np.ndarray, "n 3 2"]) -> Wraps:
-    """The wrap modes as far as the lookup shows them: along an axis on which it stays inside, a texture may as well
-    repeat."""
+    """The wrap modes that the lookup reaches: "repeat" along an axis on which it stays inside the unit square."""
     low, high = np.nanmin(lookup, axis=(0, 1)), np.nanmax(lookup, axis=(0, 1))
     inside = (low >= -OUTSIDE) & (high <= 1 + OUTSIDE)
 
-    def shown(axis: int) -> Wrap:
+    def mode(axis: int) -> Wrap:
         return "repeat" if inside[axis] or wrap[axis] not in WORDS else wrap[axis]
 
-    return shown(0), shown(1)
+    return mode(0), mode(1)
 
 
 def framed(entry: RawMap) -> RawMap:
-    """A normal map whose normals stand in the frame of the place where it is looked up (turned by the transform)."""
+    """A normal map with normals in the frame of its lookup coordinates (rotated by the transform)."""
     if entry.transform is None or entry.tangents == "looked up":
         return entry
     u, _, v = np.linalg.svd(entry.transform[:2, :2])
@@ -109,8 +108,8 @@ def framed(entry: RawMap) -> RawMap:
 
 
 def _spans(lookup: Float[np.ndarray, "n 3 2"], wrap: Wraps, shape: tuple[int, ...]) -> Spans:
-    """What one tile of the plain texture shows: two tiles of a mirrored one, all that is looked up of a clamped one and
-    a texel more on either side."""
+    """The UV range of one tile of the plain texture: two tiles of a mirrored texture; for a clamped one the range of
+    its lookup and a texel more on either side."""
 
     def span(axis: int) -> tuple[float, float]:
         if wrap[axis] == "mirror":
@@ -131,7 +130,7 @@ def _load(
     rows: Bool[np.ndarray, " f"],
     tile: int,
 ) -> tuple[Maps, tuple[str, ...]]:
-    """The `load` of a material whose UVs became plain; `uvs` are those of before."""
+    """The `load` of a material with plain UVs; `uvs` are the original ones."""
     maps, notes = load(tile)
     result: dict[str, RawMap] = {}
     for name, entry in maps.items():
@@ -144,9 +143,9 @@ def _load(
 
 
 def _alike(entry: RawMap, plain: _Plain, uvs: Float[np.ndarray, "f 3 2"] | None, rows: Bool[np.ndarray, " f"]) -> bool:
-    """Whether a map is looked up as the base map is."""
-    mine, base = (uvs if e.uvs is None else e.uvs for e in (entry, plain.base))
-    same_set = mine is base or (mine is not None and base is not None and np.array_equal(mine, base, equal_nan=True))
+    """Whether a map has the base map's lookup."""
+    own, base = (uvs if e.uvs is None else e.uvs for e in (entry, plain.base))
+    same_set = own is base or (own is not None and base is not None and np.array_equal(own, base, equal_nan=True))
     move, base_move = (np.eye(3) if e.transform is None else e.transform for e in (entry, plain.base))
     if not same_set or not np.array_equal(move, base_move):
         return False
@@ -155,8 +154,8 @@ def _alike(entry: RawMap, plain: _Plain, uvs: Float[np.ndarray, "f 3 2"] | None,
 
 
 def _unrolled(entry: RawMap, plain: _Plain, unit: bool) -> RawMap:
-    """A map whose unit square is the base's spans. Where its texels do not fall onto those of the map as it was they
-    are interpolated (and made unit length where they are normals)."""
+    """A map whose unit square covers the base's spans. Texels between those of the original map are interpolated
+    (normals are then normalised)."""
     place = dict(uvs=None, transform=None, wrap=REPEAT)
     if plain.spans == SQUARE:
         return replace(entry, **place)
@@ -178,8 +177,8 @@ def _unrolled(entry: RawMap, plain: _Plain, unit: bool) -> RawMap:
 
 
 def _texels(count: int, span: tuple[float, float], axis: int) -> tuple[np.ndarray, Float[np.ndarray, " n"]]:
-    """For every texel of the unrolled axis: the texel of the map, of `count`, at or before its centre, and how far the
-    centre lies on the way to the next (0 up to 1). Rows begin at the span's upper end, columns at its lower."""
+    """For every texel of the unrolled axis: the texel of the map, of `count`, at or before its centre, and the
+    fraction (0 up to 1) of the way to the next. Rows begin at the span's upper end, columns at its lower."""
     low, high = span if axis == 0 else (1 - span[1], 1 - span[0])
     new = int(np.clip(round((high - low) * count), 1, WORK_TEXTURE))
     place = (low + (np.arange(new) + 0.5) / new * (high - low)) * count - 0.5

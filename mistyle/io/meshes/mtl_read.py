@@ -20,17 +20,17 @@ MAX_LIBRARY_BYTES = 16 << 20
 TEXTURES = {"map_kd": "albedo", "map_pr": "roughness", "map_pm": "metallic", "norm": "normal"}
 BUMPS = ("map_bump", "bump")
 NAMING = {*TEXTURES, *BUMPS}  # statements whose pictures are opened
-# Options of a texture statement and how many values follow; the file name is what comes after them.
+# Options of a texture statement and their numbers of values; the file name follows them.
 OPTIONS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-blendu": 1, "-blendv": 1, "-boost": 1, "-texres": 1}
 OPTIONS |= {"-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1, "-colorspace": 1}
-# Statements without a note: read, without a meaning for a surface that is lit by rays, or at a value that does nothing.
+# Statements without a note: read, or without effect on a ray-traced surface.
 READ = {*NAMING, "kd", "pr", "pm", "ka", "ni", "illum", "sharpness", "map_aat"}
 OPACITY = {"d": 1.0, "tr": 0.0}
 NEUTRAL = {"tf": 1.0, "ks": 0.0, "ke": 0.0, "ps": 0.0, "pc": 0.0, "pcr": 0.0, "aniso": 0.0, "anisor": 0.0} | OPACITY
-# A linear file says so by these names of colour spaces; all others are taken as sRGB, with a note if they are not.
+# Names of linear colour spaces; all others are read as sRGB, with a note for names that are not sRGB.
 LINEAR = ("linear", "raw", "lin_rec709", "lin_srgb", "non-color", "data", "none")
 SRGB = ("srgb", "srgb_texture", "auto", "gamma22", "rec709")
-FLAT_GREY = 8  # of 255: how far the channels of a grey picture lie apart (JPEG)
+FLAT_GREY = 8  # of 255: the largest difference between the channels of a grey picture (JPEG)
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Statement:
 
     @property
     def transform(self) -> Float[np.ndarray, "3 3"] | None:
-        """For coordinates with v up; None where they stay."""
+        """The UV transform for v up; None for the identity."""
         if self.scale == (1, 1) and self.offset == (0, 0):
             return None
         return np.array([[self.scale[0], 0, self.offset[0]], [0, self.scale[1], self.offset[1]], [0, 0, 1.0]])
@@ -58,7 +58,7 @@ class Statement:
 
 @dataclass(frozen=True)
 class MtlEntry:
-    """One material as its library has it: the last value of every statement by its keyword in small letters.
+    """One material of a library: the last value of every statement by its lower-case keyword.
 
     roots    folders that texture names are relative to: the library's, then the mesh's
     spelled  the keywords as the file spells them
@@ -93,7 +93,8 @@ def read_library(library: Path, mesh: Path) -> tuple[dict[str, MtlEntry], tuple[
 
 
 def material(entry: MtlEntry, budget: Budget) -> RawMaterial:
-    """Kd counts where there is no map_Kd (many exporters write Kd 0 or 0.8 beside a texture), Pr and Pm likewise."""
+    """The raw material. Kd applies only without map_Kd (many exporters write Kd 0 or 0.8 beside a texture), as do Pr
+    and Pm."""
     named = {TEXTURES[k]: statement(v) for k, v in entry.values.items() if k in TEXTURES}
     bump = next((statement(entry.values[k]) for k in BUMPS if k in entry.values), None)
     textures = named | ({"bump": bump} if bump is not None else {})
@@ -114,7 +115,7 @@ def material(entry: MtlEntry, budget: Budget) -> RawMaterial:
 
 def unread(entries: Sequence[MtlEntry]) -> list[str]:
     """Notes on the statements of materials that change how they look and were not read."""
-    notes, left = [], {}
+    notes, skipped = [], {}
     for entry in entries:
         if "map_d" in entry.values or any(_changes(entry, key) for key in OPACITY):
             notes.append(f"The opacity of material '{entry.name}' was not read.")
@@ -122,15 +123,15 @@ def unread(entries: Sequence[MtlEntry]) -> list[str]:
             ignored = key not in READ and key not in OPACITY and key != "map_d" and _changes(entry, key)
             odd = key == "kd" and "map_kd" not in entry.values and np.isnan(_numbers(entry, key, [np.nan])[0])
             if ignored or odd:  # odd: a spectrum
-                left.setdefault(entry.library.name, {})[entry.spelled[key]] = None
-    said = (f"{library}: these statements were not read: {', '.join(keys)}." for library, keys in left.items())
-    return [*notes, *said]
+                skipped.setdefault(entry.library.name, {})[entry.spelled[key]] = None
+    sentences = (f"{library}: these statements were not read: {', '.join(keys)}." for library, keys in skipped.items())
+    return [*notes, *sentences]
 
 
 def _changes(entry: MtlEntry, key: str) -> bool:
     if key not in entry.values:
         return False
-    if key == "ns":  # the exponent of Ks; Pr says it better
+    if key == "ns":  # the exponent of Ks; Pr takes precedence
         return _changes(entry, "ks")
     if key == "ks" and {"pr", "map_pr", "pm", "map_pm"} & set(entry.values):
         return False
@@ -150,15 +151,15 @@ def _colour(entry: MtlEntry) -> list[float]:
 
 def _numbers(entry: MtlEntry, key: str, default: list[float]) -> list[float]:
     try:
-        found = [float(x) for x in entry.values.get(key, "").split()[: len(default)]]
+        values = [float(x) for x in entry.values.get(key, "").split()[: len(default)]]
     except ValueError:
         return default
-    return found if len(found) == len(default) and np.isfinite(found).all() else default
+    return values if len(values) == len(default) and np.isfinite(values).all() else default
 
 
 def statement(text: str) -> Statement:
     """A texture statement's options, and the file name behind them, which may hold spaces."""
-    rest, given = text, {}
+    rest, options = text, {}
     while (parts := rest.split(None, 1)) and parts[0].lower() in OPTIONS and len(parts) == 2:
         option, rest = parts[0].lower(), parts[1]
         values: list[str] = []
@@ -168,20 +169,20 @@ def statement(text: str) -> Statement:
                 break
             values.append(pieces[0])
             rest = pieces[1]
-        given[option] = values
+        options[option] = values
 
     def numbers(option: str, default: tuple[float, ...]) -> tuple[float, ...]:
         try:
-            found = [float(x) for x in given.get(option, ())][: len(default)]
+            floats = [float(x) for x in options.get(option, ())][: len(default)]
         except ValueError:
             return default
-        return (*found, *default[len(found) :]) if np.isfinite(found).all() else default
+        return (*floats, *default[len(floats) :]) if np.isfinite(floats).all() else default
 
     scale, offset, mm = numbers("-s", (1.0, 1.0)), numbers("-o", (0.0, 0.0)), numbers("-mm", (0.0, 1.0))
-    word = {option: (given.get(option) or [""])[0].lower() for option in ("-clamp", "-imfchan", "-colorspace")}
+    first = {option: (options.get(option) or [""])[0].lower() for option in ("-clamp", "-imfchan", "-colorspace")}
     return Statement(
         rest.strip(), (scale[0], scale[1]), (offset[0], offset[1]), any(numbers("-t", (0.0, 0.0, 0.0))),
-        word["-clamp"] == "on", numbers("-bm", (1.0,))[0], mm[0], mm[1], word["-imfchan"], word["-colorspace"],
+        first["-clamp"] == "on", numbers("-bm", (1.0,))[0], mm[0], mm[1], first["-imfchan"], first["-colorspace"],
     )  # fmt: skip
 
 
@@ -196,53 +197,53 @@ def tile_name(file: str, tile: int) -> str | None:
 def _load(textures: dict[str, Statement], entry: MtlEntry, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
     maps: dict[str, RawMap] = {}
     notes: list[str] = []
-    for name, said in textures.items():
-        wanted = tile_name(said.file, tile) or said.file
+    for name, stmt in textures.items():
+        file = tile_name(stmt.file, tile) or stmt.file
         if name == "bump" and "normal" in maps:
-            if said.file != textures["normal"].file:
-                notes.append(f"Bump map {wanted} was left out beside the normal map of material '{entry.name}'.")
+            if stmt.file != textures["normal"].file:
+                notes.append(f"Bump map {file} was left out beside the normal map of material '{entry.name}'.")
             continue
-        pixels = named_texture(entry.library, entry.roots, wanted, budget, notes)
+        pixels = named_texture(entry.library, entry.roots, file, budget, notes)
         if pixels is None:
             continue
-        found = _meant("normal" if name == "bump" else name, said, *pixels, notes)
+        entry_map = _converted("normal" if name == "bump" else name, stmt, *pixels, notes)
         if name == "bump" and not _is_normal_map(pixels[0]):
-            notes.append(f"Bump map {wanted} holds heights, not normals, and was left out.")
+            notes.append(f"Bump map {file} holds heights, not normals, and was left out.")
             continue
-        maps["normal" if name == "bump" else name] = found
+        maps["normal" if name == "bump" else name] = entry_map
     return maps, tuple(notes)
 
 
-def _meant(name: str, said: Statement, pixels: np.ndarray, linear: bool, notes: list[str]) -> RawMap:
-    """One map as its statement's options have it."""
-    if said.turbulence:
-        notes.append(f"The turbulence (-t) of texture {said.file} was not read.")
-    if said.space and said.space not in (*LINEAR, *SRGB):
-        notes.append(f"The colour space {said.space} of texture {said.file} is not known and was not read.")
+def _converted(name: str, stmt: Statement, pixels: np.ndarray, linear: bool, notes: list[str]) -> RawMap:
+    """One map with its statement's options applied."""
+    if stmt.turbulence:
+        notes.append(f"The turbulence (-t) of texture {stmt.file} was not read.")
+    if stmt.space and stmt.space not in (*LINEAR, *SRGB):
+        notes.append(f"The colour space {stmt.space} of texture {stmt.file} is not known and was not read.")
     kind: Kind = "colour" if name == "albedo" else "normal" if name == "normal" else "data"
-    if name == "albedo" and (linear or said.space in LINEAR):
+    if name == "albedo" and (linear or stmt.space in LINEAR):
         kind, pixels = "data", np.clip(fractions(pixels), 0, 1)
     elif kind == "data":
         pixels = np.clip(pixels, 0, 1) if linear else pixels
-        pixels = _channel(linear_rows(pixels) if said.space in SRGB and said.space != "auto" else pixels, said, notes)
-    if (said.base, said.gain) != (0, 1) and kind != "normal":
-        pixels = np.clip(fractions(pixels) * np.float32(said.gain) + np.float32(said.base), 0, 1)
+        pixels = _channel(linear_rows(pixels) if stmt.space in SRGB and stmt.space != "auto" else pixels, stmt, notes)
+    if (stmt.base, stmt.gain) != (0, 1) and kind != "normal":
+        pixels = np.clip(fractions(pixels) * np.float32(stmt.gain) + np.float32(stmt.base), 0, 1)
     return RawMap(
         pixels,
-        transform=said.transform,
+        transform=stmt.transform,
         kind=kind,
-        scale=said.strength if kind == "normal" else 1.0,
-        wrap=("clamp", "clamp") if said.clamp else REPEAT,
+        scale=stmt.strength if kind == "normal" else 1.0,
+        wrap=("clamp", "clamp") if stmt.clamp else REPEAT,
     )
 
 
-def _channel(pixels: Shaped[np.ndarray, "h w 3"], said: Statement, notes: list[str]) -> Shaped[np.ndarray, "h w"]:
+def _channel(pixels: Shaped[np.ndarray, "h w 3"], stmt: Statement, notes: list[str]) -> Shaped[np.ndarray, "h w"]:
     """The channel that `-imfchan` names; red where it names none."""
-    if said.channel in ("m", "z"):
-        notes.append(f"Channel {said.channel} of texture {said.file} is not read; red was taken.")
-    if said.channel == "l":
+    if stmt.channel in ("m", "z"):
+        notes.append(f"Channel {stmt.channel} of texture {stmt.file} is not read; red was used.")
+    if stmt.channel == "l":
         return fractions(pixels) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
-    return np.ascontiguousarray(pixels[..., {"g": 1, "b": 2}.get(said.channel, 0)])
+    return np.ascontiguousarray(pixels[..., {"g": 1, "b": 2}.get(stmt.channel, 0)])
 
 
 def _is_normal_map(pixels: Shaped[np.ndarray, "h w 3"]) -> bool:

@@ -21,15 +21,15 @@ STATED = (b"usemtl", b"o", b"g")  # statements that hold for all faces until the
 LINES = {b"l", b"p"}
 FREE_FORM = {b"vp", b"cstype", b"deg", b"bmat", b"step", b"curv", b"curv2", b"surf", b"parm", b"trim", b"hole", b"scrv"}
 FREE_FORM |= {b"sp", b"end", b"con", b"bzp", b"bsp", b"cdc", b"cdp", b"res"}
-# What says nothing about looks here: smoothing and merging groups, levels of detail, and rendering of old programs.
+# Statements without effect on appearance: smoothing and merging groups, levels of detail, legacy rendering.
 WITHOUT_LOOKS = {b"s", b"mg", b"lod", b"bevel", b"c_interp", b"d_interp", b"ctech", b"stech", b"shadow_obj"}
 WITHOUT_LOOKS |= {b"trace_obj", b"maplib", b"usemap"}
 
 
 def read_obj(path: Path, max_faces: int) -> Raw:
     """Polygons become fans around their first corner (concave ones are cut into ears), in file order. Lines, points,
-    free-form surfaces and faces with fewer than three corners are left out, with a note. Vertex colours (v x y z r g b)
-    are the albedo where there is no texture of it."""
+    free-form surfaces and faces with fewer than three corners are dropped, with a note. Vertex colours (v x y z r g b)
+    are the albedo where no texture is."""
     data = re.sub(rb"\\\r?\n", b" ", unmarked(read_bytes(path)))
     lines, notes = _sorted_lines(data), []
     positions = _table(lines[b"v"], 3, path, "vertices")
@@ -48,13 +48,13 @@ def read_obj(path: Path, max_faces: int) -> Raw:
     index = corners[triangles]
     material, names = _stated(lines[b"usemtl"], lines[b"usemtl_at"], polygon)
     kind = b"o" if lines[b"o"] else b"g"
-    thing, things = _stated(lines[kind], lines[kind + b"_at"], polygon)
-    materials, said = _materials(names, lines, path)
-    notes += said
+    group, groups = _stated(lines[kind], lines[kind + b"_at"], polygon)
+    materials, new_notes = _materials(names, lines, path)
+    notes += new_notes
     colours = _colours(lines[b"v"], path)
     if colours is not None:
-        colours, materials, said = coloured(colours[index[..., 0]], material, materials)
-        notes += said
+        colours, materials, new_notes = coloured(colours[index[..., 0]], material, materials)
+        notes += new_notes
     return Raw(
         kind="obj",
         positions=positions,
@@ -63,7 +63,7 @@ def read_obj(path: Path, max_faces: int) -> Raw:
         uvs=_pick(_table(lines[b"vt"], 2, path, "texture coordinates"), index[..., 1]),
         material=material,
         materials=materials,
-        primitives=_runs(material, thing, things),
+        primitives=_runs(material, group, groups),
         notes=(*notes, *_left_out(lines)),
         colours=colours,
     )
@@ -74,55 +74,56 @@ def _plain(name: str) -> RawMaterial:
 
 
 def _sorted_lines(data: bytes) -> dict[bytes, list]:
-    """The statements' arguments by keyword; `usemtl_at`, `o_at` and `g_at` hold the number of faces before each,
-    `others` all other keywords, `counts` the numbers of v, vt and vn before each face (where faces count backwards)."""
-    found: dict[bytes, list] = {k: [] for k in (b"v", b"vt", b"vn", b"f", b"mtllib", b"counts", b"others")}
-    found |= {k: [] for name in STATED for k in (name, name + b"_at")}
+    """The statements' arguments by keyword; `usemtl_at`, `o_at` and `g_at` hold the number of faces before each.
+    `others` are all other keywords; `counts` the numbers of v, vt and vn before each face (for negative face
+    indices)."""
+    statements: dict[bytes, list] = {k: [] for k in (b"v", b"vt", b"vn", b"f", b"mtllib", b"counts", b"others")}
+    statements |= {k: [] for name in STATED for k in (name, name + b"_at")}
     others: dict[bytes, None] = {}
-    v, vt, vn, f = found[b"v"], found[b"vt"], found[b"vn"], found[b"f"]
+    v, vt, vn, f = statements[b"v"], statements[b"vt"], statements[b"vn"], statements[b"f"]
     backwards = re.search(rb"^[ \t]*f[ \t][^\n]*-", data, re.MULTILINE) is not None
     for line in data.splitlines():
         parts = line.split(None, 1)
         if len(parts) < 2 or parts[0].startswith(b"#"):
             if parts and parts[0] in STATED:
-                found[parts[0]].append(b"")
-                found[parts[0] + b"_at"].append(len(f))
+                statements[parts[0]].append(b"")
+                statements[parts[0] + b"_at"].append(len(f))
             continue
         keyword, rest = parts
         if keyword == b"f":
             f.append(rest.partition(b"#")[0])
             if backwards:
-                found[b"counts"].append((len(v), len(vt), len(vn)))
+                statements[b"counts"].append((len(v), len(vt), len(vn)))
         elif keyword in (b"v", b"vt", b"vn"):
-            found[keyword].append(rest)
+            statements[keyword].append(rest)
         elif keyword == b"mtllib":
-            found[keyword].append(rest.strip())
+            statements[keyword].append(rest.strip())
         elif keyword in STATED:
-            found[keyword].append(rest.strip())
-            found[keyword + b"_at"].append(len(f))
+            statements[keyword].append(rest.strip())
+            statements[keyword + b"_at"].append(len(f))
         else:
             others[keyword] = None
-    return found | {b"others": list(others)}
+    return statements | {b"others": list(others)}
 
 
-def _table(lines: list[bytes], width: int, path: Path, what: str) -> Float[np.ndarray, "n w"]:
+def _table(lines: list[bytes], width: int, path: Path, label: str) -> Float[np.ndarray, "n w"]:
     """The first `width` numbers of every line."""
     if not lines:
         return np.zeros((0, width))
     widths = {len(line.split()) for line in lines}
     if len(widths) == 1 and (columns := widths.pop()) >= width and b"#" not in lines[0]:
-        return parse_numbers(b" ".join(lines), path, what).reshape(-1, columns)[:, :width]
+        return parse_numbers(b" ".join(lines), path, label).reshape(-1, columns)[:, :width]
     rows = [line.partition(b"#")[0].split()[:width] for line in lines]
     if width == 2:
         rows = [row + [b"0"] * (2 - len(row)) for row in rows]  # one-dimensional textures leave v out
     short = next((i for i, row in enumerate(rows) if len(row) < width), None)
     if short is not None:
-        raise refuse(path, f"line {short + 1} of its {what} with {len(rows[short])} numbers", f"{width}", AGAIN)
-    return parse_numbers(b" ".join(b" ".join(row) for row in rows), path, what).reshape(-1, width)
+        raise refuse(path, f"line {short + 1} of its {label} with {len(rows[short])} numbers", f"{width}", AGAIN)
+    return parse_numbers(b" ".join(b" ".join(row) for row in rows), path, label).reshape(-1, width)
 
 
 def _colours(lines: list[bytes], path: Path) -> Float[np.ndarray, "v 3"] | None:
-    """Linear vertex colours, white for vertices that have none; None where no vertex has any."""
+    """Linear vertex colours, white for vertices without one; None where no vertex has any."""
     if max((line.count(b" ") + line.count(b"\t") for line in lines), default=0) < 5:
         return None
     rows = [line.partition(b"#")[0].split()[3:6] for line in lines]
@@ -157,11 +158,11 @@ def _corners(
         before = np.repeat(np.array(lines[b"counts"]).reshape(-1, 3), sizes, axis=0)
         index = np.where(index < 0, before + index + 1, index)
         index[index < 0] = 2**31
-    for column, (count, what) in enumerate(zip(counts, ("vertex", "texture coordinate", "normal"), strict=True)):
+    for column, (count, label) in enumerate(zip(counts, ("vertex", "texture coordinate", "normal"), strict=True)):
         top = int(index[:, column].max(initial=0))
         if top > count:
             shown = "before the first" if top == 2**31 else top
-            raise refuse(path, f"a face that uses {what} {shown}", f"1 to {count}", AGAIN)
+            raise refuse(path, f"a face that uses {label} {shown}", f"1 to {count}", AGAIN)
     if (index[:, 0] == 0).any():
         raise refuse(path, "a face that uses vertex 0", f"1 to {counts[0]}", AGAIN)
     return index - 1, sizes
@@ -192,12 +193,12 @@ def _stated(
     return seen[statement], list(numbers)
 
 
-def _runs(material: Int[np.ndarray, " f"], thing: Int[np.ndarray, " f"], things: list[str]) -> tuple[Primitive, ...]:
+def _runs(material: Int[np.ndarray, " f"], group: Int[np.ndarray, " f"], groups: list[str]) -> tuple[Primitive, ...]:
     """One primitive for each run of faces with the same material and object."""
-    cuts = np.flatnonzero((np.diff(material) != 0) | (np.diff(thing) != 0)) + 1
+    cuts = np.flatnonzero((np.diff(material) != 0) | (np.diff(group) != 0)) + 1
     bounds = [0, *cuts.tolist(), len(material)]
     return tuple(
-        Primitive(-1, -1, -1, a, b, int(material[a]), -1, -1, name=things[thing[a]])
+        Primitive(-1, -1, -1, a, b, int(material[a]), -1, -1, name=groups[group[a]])
         for a, b in zip(bounds[:-1], bounds[1:], strict=True)
         if b > a
     )
@@ -207,8 +208,8 @@ def _runs(material: Int[np.ndarray, " f"], thing: Int[np.ndarray, " f"], things:
 
 
 def library_files(names: list[bytes], path: Path) -> tuple[list[Path], list[str]]:
-    """The material libraries that statements name and that are there, and notes about the others."""
-    found: dict[Path, None] = {}
+    """The existing material libraries among those that statements name, and notes about the others."""
+    libraries: dict[Path, None] = {}
     notes: list[str] = []
     for name in dict.fromkeys(single for n in decoded(*names)[0] for single in file_names(n, path)):
         try:
@@ -219,10 +220,10 @@ def library_files(names: list[bytes], path: Path) -> tuple[list[Path], list[str]
         if target is None:
             notes.append(f"Material library {name} is not there; its materials were read as plain.")
             continue
-        found[target] = None
+        libraries[target] = None
         if place is not None:
             notes.append(f"Material library {name} was found by its name at {place}.")
-    return list(found), notes
+    return list(libraries), notes
 
 
 def file_names(statement: str, path: Path) -> list[str]:
@@ -233,17 +234,17 @@ def file_names(statement: str, path: Path) -> list[str]:
 
 
 def _materials(names: list[str], lines: dict[bytes, list], path: Path) -> tuple[tuple[RawMaterial, ...], list[str]]:
-    """The material of every name that faces use ("" where none is stated), and notes."""
+    """The material of every name that faces use ("" without a statement), and notes."""
     files, notes = library_files(lines[b"mtllib"], path)
     library: dict[str, MtlEntry] = {}
     for file in files:
         try:
-            entries, said = read_library(file, path)
+            entries, library_notes = read_library(file, path)
         except InputRefused as error:
             notes.append(f"Material library {file.name} was left out: {error}")
             continue
         library |= entries
-        notes.extend(said)
+        notes.extend(library_notes)
     used = [_entry_of(name, library, bool(lines[b"usemtl"]), notes) for name in names]
     unknown = [name for name, entry in zip(names, used, strict=True) if entry is None and name]
     if unknown:
@@ -253,22 +254,22 @@ def _materials(names: list[str], lines: dict[bytes, list], path: Path) -> tuple[
         notes.append("Some faces state no material (usemtl) and were read as plain.")
     notes.extend(unread([entry for entry in used if entry is not None]))
     budget = Budget(path)
-    made = (_plain(n) if entry is None else material(entry, budget) for n, entry in zip(names, used, strict=True))
-    return tuple(made), notes
+    materials = (_plain(n) if entry is None else material(entry, budget) for n, entry in zip(names, used, strict=True))
+    return tuple(materials), notes
 
 
 def _entry_of(name: str, library: dict[str, MtlEntry], stated: bool, notes: list[str]) -> MtlEntry | None:
-    """A name's material: its own, else the only one of that name in other letters, else the only one at all where the
-    file states none."""
+    """A name's material: the exact name, else the only case-insensitive match, else the library's only material where
+    the file states none."""
     if name in library:
         return library[name]
-    alike = [entry for other, entry in library.items() if name and other.casefold() == name.casefold()]
-    if len(alike) == 1:
-        notes.append(f"Material '{name}' was taken for '{alike[0].name}' of its library.")
-        return alike[0]
+    matches = [entry for key, entry in library.items() if name and key.casefold() == name.casefold()]
+    if len(matches) == 1:
+        notes.append(f"Material '{name}' was matched to '{matches[0].name}' of its library.")
+        return matches[0]
     if not stated and len(library) == 1:
         (entry,) = library.values()
-        notes.append(f"No face states a material (usemtl): '{entry.name}', the only one of its library, was taken.")
+        notes.append(f"No face states a material (usemtl): '{entry.name}', the only one of its library, was used.")
         return entry
     return None
 

@@ -17,8 +17,8 @@ def write_obj(
 ) -> None:
     """Write `path` and the .mtl beside it: the mesh with its own `positions`, one material per part.
 
-    Vertices keep their order; equal UVs and normals are shared. `tiles` are the parts' UDIM tiles: their UVs are moved
-    there. Texture names are relative to the folder.
+    Vertices keep their order; equal UVs and normals are shared. `tiles` are the parts' UDIM tiles, to which
+    their UVs are moved. Texture names are relative to the folder.
     """
     uvs = mesh.corner_uvs.astype(np.float64)
     offset = np.array([[(t - 1001) % 10, (t - 1001) // 10] for t in tiles], float)
@@ -40,7 +40,7 @@ def write_obj(
 
 
 def _digits(positions: Float[np.ndarray, "v 3"]) -> int:
-    """Digits that leave eight or nine for the mesh's own size, wherever it lies; 17 are all of a double."""
+    """Digits that resolve the mesh's own size to eight or nine digits at any offset; 17 are all of a double."""
     size, reach = float(np.ptp(positions, axis=0).max()), float(np.abs(positions).max())
     far = int(np.log10(reach / size)) if reach > size > 0 else 0
     return min(9 + max(far - 1, 0), 17)
@@ -64,7 +64,7 @@ def _materials(looks: Sequence[TexturedMaterial]) -> str:
 
 
 def _shared(rows: Float[np.ndarray, "n c"]) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct rows, and which of them each row is."""
+    """Distinct rows, and the index of each row among them."""
     rounded = np.round(rows, 9) + 0.0
     first, index = distinct(rounded)
     return rounded[first], index

@@ -1,4 +1,4 @@
-"""What a mesh file says, before anything is decided about it."""
+"""Parsed mesh files, before `prepare` chooses UVs, normals and axes."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -16,13 +16,13 @@ from mistyle.io.sandbox.bounds import WORK_TEXTURE
 
 @dataclass(frozen=True)
 class RawMap:
-    """One texture: values as `Material` has them (row 0 is v = 1) and how to look them up. With a `kind` the values are
-    still the file's own numbers, which io/images/quantisation.py makes into such (normals with x and y times `scale`).
+    """One texture: values as `Material` has them (row 0 is v = 1) and their lookup. With a `kind` the values are still
+    the file's own numbers, which io/images/quantisation.py converts (normals with x and y times `scale`).
 
-    The lookup is at `uvs` where the map uses another UV set than the material's base, else at the mesh's UVs; then
-    `transform` (v up, homogeneous rows) is applied to it, and `wrap` says what lies outside the unit square.
-    `tangents` says which frame the normals of a normal map stand in: that of the UVs as authored, before the transform,
-    or that of the place where the map is looked up.
+    The lookup is at `uvs` where the map uses another UV set than the material's base, else at the mesh's UVs. Then
+    `transform` (v up, homogeneous rows) is applied to it, and `wrap` sets the values outside the unit square.
+    `tangents` is the frame of a normal map's normals: that of the UVs as authored, before the transform, or that of the
+    lookup coordinates.
     """
 
     values: np.ndarray
@@ -34,7 +34,7 @@ class RawMap:
     tangents: Literal["authored", "looked up"] = "authored"
 
     def finished(self) -> "RawMap":
-        """With values as `Material` has them."""
+        """The map with values as `Material` has them."""
         if self.kind is None:
             return self
         values = finished(self.values, self.kind, self.scale, WORK_TEXTURE)
@@ -46,8 +46,8 @@ Maps = Mapping[str, RawMap]  # keys: albedo, normal, roughness, metallic, opacit
 
 @dataclass(frozen=True)
 class Tile:
-    """The decoded textures of one UDIM tile, sentences about what could not be read, and why the tile as a whole cannot
-    be used (None: it can)."""
+    """The decoded textures of one UDIM tile, sentences about unread parts, and the reason why the tile as a whole
+    cannot be used (None: it can)."""
 
     maps: dict[str, RawMap]
     notes: tuple[str, ...] = ()
@@ -56,23 +56,23 @@ class Tile:
 
 @dataclass(frozen=True)
 class Textures:
-    """The `load` of a material whose textures are decoded: tiles by number, 1001 for every number that is not there.
-    Its maps may be unfinished."""
+    """The `load` of a material whose textures are decoded: tiles by number, 1001 for every missing number. Its maps may
+    be unfinished."""
 
     tiles: dict[int, Tile]
 
     def __call__(self, tile: int) -> tuple[Maps, tuple[str, ...]]:
-        found = self.tiles.get(tile) or self.tiles[1001]
-        if found.refused is not None:
-            raise InputRefused(found.refused)
-        return found.maps, found.notes
+        entry = self.tiles.get(tile) or self.tiles[1001]
+        if entry.refused is not None:
+            raise InputRefused(entry.refused)
+        return entry.maps, entry.notes
 
 
 @dataclass(frozen=True)
 class RawMaterial:
     """A material of the file. `load` decodes its textures for a UDIM tile (1001 where there are none) and returns them
-    with sentences about what could not be read. `udim`: True when textures are named as tiles, False when a texture
-    repeats over all of them, None when there is none."""
+    with sentences about unread parts. `udim`: True when textures are named as tiles, False when a texture
+    repeats over all of them, None without textures."""
 
     name: str
     load: Callable[[int], tuple[Maps, tuple[str, ...]]]
@@ -87,13 +87,13 @@ class RawMaterial:
 class Raw:
     """Triangles in file order, positions in the file's units and axes (glTF: world space).
 
-    normals   per corner, zero or NaN where the file gives none; None where it gives none at all
+    normals   per corner, zero or NaN where the file has none; None where it has none at all
     uvs       per corner, v up, NaN where a face has none; None where no face has any
     material  index into `materials` per face
     twin      the face whose UVs each face shares because the file stores them once (glTF instances), itself otherwise
-    authored  the `uvs` of the file where io/meshes/lookups.py made others of them, else None
-    colours   per corner, linear Rec.709, 0..1: what the albedo is to be multiplied by (vertex colours); None for white
-    alphas    per corner, 0..1: what the opacity is to be multiplied by; None for 1
+    authored  the `uvs` of the file where io/meshes/lookups.py replaced them, else None
+    colours   per corner, linear Rec.709, 0..1: factor of the albedo (vertex colours); None for white
+    alphas    per corner, 0..1: factor of the opacity; None for 1
     """
 
     kind: str
@@ -113,8 +113,7 @@ class Raw:
 
 @dataclass(frozen=True)
 class Extent:
-    """How large the asset of a file will be: faces, those of them that will be unwrapped anew, texture sets, and bytes
-    of its own maps as float32."""
+    """The size of a file's asset: faces, faces to unwrap anew, texture sets, and bytes of its own maps as float32."""
 
     faces: int
     unwrapped: int = 0
@@ -124,21 +123,21 @@ class Extent:
 
 @dataclass(frozen=True)
 class Corners:
-    """What several corners share, stored once: corner c of face f has `values[index[f, c]]`."""
+    """Values that corners share, stored once: corner c of face f has `values[index[f, c]]`."""
 
     values: Float[np.ndarray, "n k"]
     index: Int[np.ndarray, "f 3"]
 
     def finished(self) -> Float[np.ndarray, "f 3 k"]:
-        """Corner by corner."""
-        # Clipped: whoever sent the index may have sent anything.
+        """The values per corner."""
+        # Clipped: the index comes from the untrusted reader process.
         return self.values.take(self.index, axis=0, mode="clip")
 
 
 @dataclass(frozen=True)
 class Indexed:
-    """A Raw on its way from one process to another: its normals, uvs and colours, several times smaller, beside it, and
-    its positions perhaps as float32."""
+    """A Raw for the transfer between processes: its normals, uvs and colours indexed, several times smaller, and its
+    positions perhaps as float32."""
 
     raw: Raw
     normals: Corners
@@ -147,7 +146,7 @@ class Indexed:
     alphas: Corners | None = None
 
     def finished(self) -> Raw:
-        """As everything after the border has it."""
+        """The Raw in its full form."""
         return replace(
             self.raw,
             positions=self.raw.positions.astype(np.float64, copy=False),
@@ -158,9 +157,9 @@ class Indexed:
         )
 
 
-def spelled(found: Raw | Indexed) -> Raw:
-    """What a reader gave, corner by corner."""
-    return found.finished() if isinstance(found, Indexed) else found
+def spelled(mesh: Raw | Indexed) -> Raw:
+    """A reader's result in its full form, per corner."""
+    return mesh.finished() if isinstance(mesh, Indexed) else mesh
 
 
 def no_textures(tile: int) -> tuple[Maps, tuple[str, ...]]:

@@ -47,9 +47,12 @@ class _PlyElement:
 
 
 def read_ply(path: Path, max_faces: int) -> Raw:
-    """PLY with polygons of any size, or triangle strips; normals nx ny nz, texture coordinates per vertex (u v, s t,
-    texture_u texture_v) or per face corner (the list texcoord), pictures named by `comment TextureFile` (several by the
-    faces' texnumber), and colours of vertices or faces, which are the albedo where there is no picture."""
+    """PLY with polygons of any size, or triangle strips.
+
+    Also read: normals nx ny nz; texture coordinates per vertex (u v, s t, texture_u texture_v) or per face corner (the
+    list texcoord); pictures of `comment TextureFile` (several by the faces' texnumber); colours of vertices or faces,
+    which are the albedo where no picture is.
+    """
     data = read_bytes(path)
     data = unmarked(data) if data.startswith(b"\xef\xbb\xbf") else data
     elements, form, start = _ply_header(data, path)
@@ -83,8 +86,8 @@ def read_ply(path: Path, max_faces: int) -> Raw:
     raw, notes = _textured(raw, texture_files(data[:start]), face, polygon, path), small_faces(sizes)
     colours = _colours(tables, elements, triangles, polygon)
     if colours is not None:
-        colours, materials, said = coloured(colours, raw.material, raw.materials)
-        raw, notes = replace(raw, colours=colours, materials=materials), notes + said
+        colours, materials, colour_notes = coloured(colours, raw.material, raw.materials)
+        raw, notes = replace(raw, colours=colours, materials=materials), notes + colour_notes
     return replace(raw, notes=(*notes, *raw.notes))
 
 
@@ -109,7 +112,8 @@ def _polygons(tables: dict[str, dict]) -> tuple[Int[np.ndarray, " p"], Int[np.nd
 
 
 def _unrolled(counts: Int[np.ndarray, " s"], index: Int[np.ndarray, " c"]) -> Int[np.ndarray, "t 3"]:
-    """The triangles of strips: -1 begins a new one, every second triangle is turned, those without area only turn."""
+    """The triangles of strips: -1 begins a new strip, every second triangle is flipped, degenerate ones only flip
+    parity."""
     ends = np.zeros(len(index) + 1, bool)
     ends[np.cumsum(counts)] = True
     first = np.flatnonzero(np.concatenate([[True], (index[:-1] < 0)]) | ends[:-1])  # of each strip
@@ -131,12 +135,12 @@ def _textured(raw: Raw, files: list[str], face: dict, polygon: Int[np.ndarray, "
     loads = [partial(_load, file, path, budget) for file in files]
     materials = [RawMaterial(*pair, False, roughness_factor=0.5) for pair in zip(stems, loads, strict=True)]
     number = face.get("texnumber", np.zeros(0))
-    given = len(number) > polygon.max(initial=0)
-    if len(files) > 1 and not given:
-        notes = (*notes, "Its header names several textures, but faces have no texnumber; the first was taken.")
+    numbered = len(number) > polygon.max(initial=0)
+    if len(files) > 1 and not numbered:
+        notes = (*notes, "Its header names several textures, but faces have no texnumber; the first was used.")
     with np.errstate(invalid="ignore"):
-        wanted = np.nan_to_num(number[polygon]) if given else np.zeros(len(polygon))
-        which = np.clip(wanted, 0, len(files) - 1).astype(np.int64)
+        file_number = np.nan_to_num(number[polygon]) if numbered else np.zeros(len(polygon))
+        which = np.clip(file_number, 0, len(files) - 1).astype(np.int64)
     used, material = np.unique(which, return_inverse=True)
     cuts = [0, *(np.flatnonzero(np.diff(material)) + 1).tolist(), len(material)]
     runs = (Primitive(-1, -1, -1, a, b, int(material[a]), -1, -1) for a, b in zip(cuts[:-1], cuts[1:], strict=True))
@@ -146,10 +150,10 @@ def _textured(raw: Raw, files: list[str], face: dict, polygon: Int[np.ndarray, "
 
 def _load(file: str, path: Path, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
     notes: list[str] = []
-    found = named_texture(path, mesh_folders(path), file, budget, notes)
-    if found is None:
+    texture = named_texture(path, mesh_folders(path), file, budget, notes)
+    if texture is None:
         return {}, tuple(notes)
-    pixels, linear = found
+    pixels, linear = texture
     entry = RawMap(np.clip(pixels, 0, 1), kind="data") if linear else RawMap(pixels, kind="colour")
     return {"albedo": entry}, tuple(notes)
 
@@ -190,7 +194,7 @@ def _uvs_of(vertex, face, sizes, triangles, pick) -> Float[np.ndarray, "f 3 2"] 
 
 
 def _ply_header(data: bytes, path: Path) -> tuple[list[_PlyElement], str, int]:
-    """Elements, byte order ("<", ">" or "ascii") and where the data begin."""
+    """Elements, byte order ("<", ">" or "ascii") and the offset of the data."""
     end = re.search(rb"\bend_header[ \t]*\r?\n", data[:MAX_HEADER])
     if not data.startswith(b"ply") or end is None:
         raise refuse(path, "no PLY header", "a text from 'ply' to 'end_header'", AGAIN)
@@ -318,7 +322,7 @@ def _ragged(data: bytes, at: int, element: _PlyElement, order: str, path: Path) 
                     raise ValueError("a negative length")
                 flat[p.name].append(np.frombuffer(data, kind, length, at) if length else np.zeros(0, kind))
                 at += length * kind.itemsize
-    except ValueError as error:  # also what numpy says where the buffer is too small
+    except ValueError as error:  # also numpy's error where the buffer is too small
         raise refuse(
             path, f"an element '{element.name}' that ends early", f"{element.count} of them", CUT_OFF
         ) from error

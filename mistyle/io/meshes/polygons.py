@@ -1,4 +1,4 @@
-"""Numbers and polygons out of text and bytes."""
+"""Parsing of numbers, triangulation of polygons, and checks of parsed meshes."""
 
 from pathlib import Path
 
@@ -11,15 +11,15 @@ MAX_EARS = 500
 MAX_COORDINATE = 1e18
 
 
-def parse_numbers(text: bytes, path: Path, what: str) -> Float[np.ndarray, " n"]:
-    """All numbers of a text separated by white space; refuses anything else in it."""
+def parse_numbers(text: bytes, path: Path, label: str) -> Float[np.ndarray, " n"]:
+    """All numbers of a text separated by white space; refuses all other tokens."""
     tokens = text.split()
     try:
         return np.array(tokens, dtype=np.bytes_).astype(np.float64) if tokens else np.zeros(0)
     except ValueError as error:
-        wrong = next((t for t in tokens if not _is_number(t)), b"")
+        bad = next((t for t in tokens if not _is_number(t)), b"")
         raise refuse(
-            path, f"{wrong[:40].decode('ascii', 'replace')!r} among {what}", "a number", "Export the mesh again"
+            path, f"{bad[:40].decode('ascii', 'replace')!r} among {label}", "a number", "Export the mesh again"
         ) from error
 
 
@@ -32,8 +32,8 @@ def _is_number(token: bytes) -> bool:
 
 
 def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "t 3"]:
-    """Corner indices of the triangles that polygons with so many corners fall into, in order: each polygon is a fan
-    around its first corner (right for convex polygons), its corners numbered on from those of the polygon before.
+    """Corner indices of the triangles of polygons with `sizes` corners, in order. Each polygon is a fan around its
+    first corner (right for convex polygons). Corners are numbered across all polygons.
     Polygons with fewer than three corners give no triangle."""
     first = np.cumsum(sizes) - sizes
     count = np.maximum(sizes - 2, 0)
@@ -43,7 +43,7 @@ def fan(sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, "t 3"]:
 
 
 def triangulate(sizes: Int[np.ndarray, " p"], corners: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, "t 3"]:
-    """As `fan`, but concave polygons are cut into ears, so that their triangles neither overlap nor leave them.
+    """As `fan`, but concave polygons are cut into ears, so that their triangles neither overlap nor leave the polygon.
 
     `corners` holds the position of every polygon corner. Polygons of more than MAX_EARS corners, and those that cross
     themselves, stay fans.
@@ -61,21 +61,21 @@ def triangulate(sizes: Int[np.ndarray, " p"], corners: Float[np.ndarray, "c 3"])
 
 
 def _concave(sizes: Int[np.ndarray, " p"], corners: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " k"]:
-    """Polygons of four and more corners that turn the other way somewhere (against their Newell normal)."""
+    """Polygons of four and more corners with a reflex corner (against their Newell normal)."""
     first = np.repeat(np.cumsum(sizes) - sizes, sizes)
     size = np.repeat(sizes, sizes)
     step = np.arange(len(first)) - first
-    here, after, before = corners, corners[first + (step + 1) % size], corners[first + (step - 1) % size]
+    corner, after, before = corners, corners[first + (step + 1) % size], corners[first + (step - 1) % size]
     polygon = np.repeat(np.arange(len(sizes)), sizes)
-    around = np.cross(here - corners[first], after - corners[first])
+    around = np.cross(corner - corners[first], after - corners[first])
     normal = np.stack([np.bincount(polygon, around[:, k], len(sizes)) for k in range(3)], axis=1)
-    turn = (np.cross(here - before, after - here) * normal[polygon]).sum(axis=1)
+    turn = (np.cross(corner - before, after - corner) * normal[polygon]).sum(axis=1)
     scale = (normal**2).sum(axis=1)[polygon]
     return np.unique(polygon[(turn < -1e-9 * scale) & (size > 3)])
 
 
 def _flattened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """A polygon in its own plane, counter-clockwise."""
+    """A polygon projected to a coordinate plane, counter-clockwise."""
     away = points - points[0]
     normal = np.cross(away, np.roll(away, -1, axis=0)).sum(axis=0)
     drop = int(np.abs(normal).argmax())
@@ -86,7 +86,7 @@ def _flattened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
 def _ears(points: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "t 3"] | None:
     """Ear clipping (Meisters 1975) of a counter-clockwise polygon; None where no ear is left (it crosses itself)."""
     rest = list(range(len(points)))
-    found = []
+    ears = []
     while len(rest) > 3:
         for k in range(len(rest)):
             a, b, c = (points[rest[(k + d) % len(rest)]] for d in (-1, 0, 1))
@@ -96,12 +96,12 @@ def _ears(points: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "t 3"] | None:
             inside = (_turn(a, b, others) >= 0) & (_turn(b, c, others) >= 0) & (_turn(c, a, others) >= 0)
             at_corner = (others[:, None] == np.stack([a, b, c])).all(axis=2).any(axis=1)
             if not (inside & ~at_corner).any():
-                found.append((rest[k - 1], rest[k], rest[(k + 1) % len(rest)]))
+                ears.append((rest[k - 1], rest[k], rest[(k + 1) % len(rest)]))
                 del rest[k]
                 break
         else:
             return None
-    return np.array([*found, tuple(rest)])
+    return np.array([*ears, tuple(rest)])
 
 
 def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray | np.float64:
@@ -109,11 +109,11 @@ def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray | np.float6
     return (b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0])
 
 
-def check_indices(index: Int[np.ndarray, "..."], count: int, path: Path, what: str) -> None:
+def check_indices(index: Int[np.ndarray, "..."], count: int, path: Path, label: str) -> None:
     """Refuse indices outside 0..count-1."""
     if index.size and (index.min() < 0 or index.max() >= count):
-        wrong = int(index.max() if index.max() >= count else index.min())
-        raise refuse(path, f"a face that uses {what} {wrong}", f"0 to {count - 1}", "Export the mesh again")
+        bad = int(index.max() if index.max() >= count else index.min())
+        raise refuse(path, f"a face that uses {label} {bad}", f"0 to {count - 1}", "Export the mesh again")
 
 
 def check_positions(positions: Float[np.ndarray, "v 3"], path: Path) -> None:
@@ -127,8 +127,8 @@ def check_positions(positions: Float[np.ndarray, "v 3"], path: Path) -> None:
         raise refuse(path, found, f"at most {MAX_COORDINATE:.0e}", "Scale the mesh")
 
 
-def too_many(count: int, limit: int, path: Path, what: str = "faces") -> None:
-    """Refuse more than `limit` of something."""
+def too_many(count: int, limit: int, path: Path, label: str = "faces") -> None:
+    """Refuse more than `limit` elements."""
     if count > limit:
         fix = "Simplify the mesh (Blender: Decimate), or raise --max-faces"
-        raise refuse(path, f"{count} {what}", f"at most {limit}", fix)
+        raise refuse(path, f"{count} {label}", f"at most {limit}", fix)

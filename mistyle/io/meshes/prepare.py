@@ -1,4 +1,4 @@
-"""From what a file says to an asset: working space, normals, one usable set of UVs for every material."""
+"""Conversion of a parsed mesh to an asset: working space, normals, one usable set of UVs for every material."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -23,22 +23,24 @@ from mistyle.io.meshes.parsed_mesh import Extent, Raw, RawMap, RawMaterial
 from mistyle.io.meshes.polygons import check_positions
 from mistyle.io.sandbox.bounds import refuse
 
-# Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
+# Faces below this area in the unit sphere are degenerate (float32 positions).
 NO_AREA = 1e-13
-ONE_COLOUR = 1 / 512  # vertex colours that differ by less (linear) are one
+ONE_COLOUR = 1 / 512  # vertex colours that differ by less (linear) are equal
 TORN = "faces that share texels have different vertex colours"
-MAX_TORN = 0.05  # two faces may give a texel vertex colours that differ so far (linear)
-PALETTE = 4  # texels that a face shows on average, below which a texture is a palette
-FACE_TEXELS = 64  # of a palette's face, once it has texels of its own
+MAX_TORN = 0.05  # largest difference (linear) of two faces' vertex colours in one texel
+PALETTE = 4  # mean texels a face, below which a texture is a palette
+FACE_TEXELS = 64  # of a palette's face after resampling
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
-SIDEWAYS = "The mesh seems to lie on its side: it is tallest along z and its base is there. --up z turns it upright."
+SIDEWAYS = (
+    "The mesh seems to lie on its side: it is tallest along z, with its base at the lower end. --up z turns it upright."
+)
 UnwrapMode = Literal["keep", "new", "auto"]
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What becomes of one material's UVs: rows of its faces, kept layout (None: unwrap), the reason for unwrapping,
-    whether its maps have to be carried over to the new or kept UVs."""
+    """The decision on one material's UVs: rows of its faces, kept layout (None: unwrap), the reason for unwrapping, and
+    whether its maps must be resampled to the new or kept UVs."""
 
     rows: Int[np.ndarray, " n"]
     layout: Layout | None
@@ -47,7 +49,7 @@ class _Plan:
 
 
 def extent(raw: Raw, path: Path, uv: UnwrapMode, size: int) -> Extent:
-    """What `prepare` would make of a file, without unwrapping it; refuses what that refuses on the way."""
+    """The size of `prepare`'s result, without unwrapping; refuses the same files."""
     check_positions(raw.positions, path)
     raw = plain_lookups(raw)
     area = np.linalg.norm(area_vectors(raw.positions, raw.faces), axis=1)
@@ -91,8 +93,8 @@ def _one_colour(colours: Float[np.ndarray, "f 3 c"]) -> bool:
 def prepare(
     raw: Raw, path: Path, uv: UnwrapMode, up: Literal["y", "z"], size: int, progress: Callable[[float], None]
 ) -> Asset:
-    """Decide, unwrap where needed, and put everything into the working space. `size` is the atlas that padding is
-    meant for."""
+    """Choose UVs, unwrap where needed, and convert the mesh to the working space. `size` is the atlas size for the
+    padding in texels."""
     check_positions(raw.positions, path)
     raw = plain_lookups(raw)
     authored = raw.uvs if raw.authored is None else raw.authored
@@ -123,12 +125,14 @@ def prepare(
     )
     materials = []
     for p, (material, tile) in enumerate(owners):
-        made, said = _material(raw, mesh, p, raw.materials[material], tile, plans[material].carried, size)
-        materials.append(made)
-        notes.extend(said)
+        part_material, part_notes = _material(
+            raw, mesh, p, raw.materials[material], tile, plans[material].carried, size
+        )
+        materials.append(part_material)
+        notes.extend(part_notes)
     progress(1.0)
-    kept = authored is not None and np.array_equal(corner_uvs, authored)
-    how = "new" if any(p.layout is None for p in plans) else "kept" if kept else "shifted"
+    unchanged = authored is not None and np.array_equal(corner_uvs, authored)
+    uv_state = "new" if any(p.layout is None for p in plans) else "kept" if unchanged else "shifted"
     source = Source(
         path=path,
         kind=raw.kind,
@@ -136,15 +140,15 @@ def prepare(
         user_positions=raw.positions,
         work_from_user=work_from_user,
         old_uvs=None if authored is None else np.nan_to_num(authored).astype(np.float32),
-        uv=how,
+        uv=uv_state,
         notes=tuple(dict.fromkeys(notes)),
     )
     return Asset(name=path.stem, mesh=mesh, materials=tuple(materials), source=source)
 
 
 def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
-    """Turns Z up to Y up where asked, and brings the sphere around the box of the vertices that faces with an area use
-    to the unit sphere."""
+    """Turns Z up to Y up if requested, and maps the bounding sphere to the unit sphere. The sphere is centred on the
+    box of vertices of non-degenerate faces."""
     turn = Y_FROM_Z if up == "z" else np.eye(3)
     used = raw.positions[np.unique(raw.faces[has_area] if has_area.any() else raw.faces)] @ turn.T
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
@@ -160,27 +164,27 @@ def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: str) -> Float[n
 def _normals(
     raw: Raw, work: np.ndarray, points: np.ndarray, work_from_user: np.ndarray, notes: list[str]
 ) -> Float[np.ndarray, "f 3 3"]:
-    """The file's corner normals, unit, in working axes; smooth ones within a crease where it has none."""
+    """The file's corner normals, unit, in working axes; smooth ones with creases where it has none."""
     if raw.normals is None:
         notes.append("The mesh has no normals: smooth ones were computed, with creases at 50 degrees.")
         return crease_normals(work, raw.faces, points)
     fine = usable_normals(raw.normals)
-    given = np.where(fine[..., None], raw.normals, 1).astype(np.float64)
+    normals = np.where(fine[..., None], raw.normals, 1).astype(np.float64)
     turn = work_from_user[:3, :3] / np.linalg.norm(work_from_user[0, :3])
-    given = (given / np.linalg.norm(given, axis=2, keepdims=True)) @ turn.T
+    normals = (normals / np.linalg.norm(normals, axis=2, keepdims=True)) @ turn.T
     if not fine.all():
         bad = int((~fine).sum())
         notes.append(
-            f"{bad} of {fine.size} corner normals are missing, zero or not finite: computed ones took their place."
+            f"{bad} of {fine.size} corner normals are missing, zero or not finite: computed ones replace them."
         )
-        given = np.where(fine[..., None], given, crease_normals(work, raw.faces, points))
-    return given.astype(np.float32)
+        normals = np.where(fine[..., None], normals, crease_normals(work, raw.faces, points))
+    return normals.astype(np.float32)
 
 
 def _plan(
     raw: Raw, material: int, points: np.ndarray, area: np.ndarray, uv: UnwrapMode, path: Path, notes: list[str]
 ) -> _Plan:
-    """Keep a material's UVs or unwrap it; says so in `notes`, refuses where `keep` cannot be."""
+    """Keep a material's UVs or unwrap it; records the decision in `notes`. Refuses unusable UVs for `keep`."""
     rows = np.flatnonzero(raw.material == material)
     name = raw.materials[material].name
     own = _own(raw, rows)
@@ -189,19 +193,19 @@ def _plan(
         return _Plan(rows, None, "requested")
     layout, reason = _layout(raw, raw.uvs, rows, points, area)
     if reason and raw.authored is not None:
-        other, no = _layout(raw, raw.authored, rows, points, area)
-        if not no and other is not None:
+        authored_layout, refusal = _layout(raw, raw.authored, rows, points, area)
+        if not refusal and authored_layout is not None:
             notes.append(
                 f"Material '{name}' keeps its UVs as authored and its textures were resampled to them, since with "
                 f"their transform {reason}."
             )
-            _say(name, other.verdicts, len(own) < len(rows), notes)
-            return _Plan(rows, other, "")
+            _add_notes(name, authored_layout.verdicts, len(own) < len(rows), notes)
+            return _Plan(rows, authored_layout, "")
     if layout is not None and reason == TORN and uv == "keep":
         notes.append(f"Material '{name}': {reason}; each texel takes those of its first face.")
         reason = ""
     if layout is not None and not reason:
-        _say(name, layout.verdicts, len(own) < len(rows), notes)
+        _add_notes(name, layout.verdicts, len(own) < len(rows), notes)
         return _Plan(rows, layout, "", carried=False)
     if uv == "keep":
         found = f"material '{name}' whose UVs cannot be kept ({reason})"
@@ -213,7 +217,7 @@ def _plan(
 def _layout(
     raw: Raw, uvs: Float[np.ndarray, "f 3 2"] | None, rows: np.ndarray, points: np.ndarray, area: np.ndarray
 ) -> tuple[Layout | None, str]:
-    """One material's faces laid out at `uvs`, and why they cannot be painted so ("": they can)."""
+    """One material's faces laid out at `uvs`, and the reason why they cannot be painted ("": they can)."""
     if uvs is None or not np.isfinite(uvs[rows]).any():
         return None, "it has no UVs"
     own = _own(raw, rows)
@@ -225,7 +229,7 @@ def _layout(
 
 
 def _one_colour_a_texel(raw: Raw, own: Int[np.ndarray, " n"], layout: Layout) -> bool:
-    """Whether faces that share texels have (nearly) the same vertex colours there, so that a texture can have them."""
+    """Whether faces that share texels agree (nearly) in vertex colours, so that a texture can hold them."""
     if raw.colours is None or max(v.shared + v.overlap for v in layout.verdicts) == 0:
         return True
     colours, size, covered, torn = raw.colours[own], 256, 0, 0
@@ -240,7 +244,7 @@ def _one_colour_a_texel(raw: Raw, own: Int[np.ndarray, " n"], layout: Layout) ->
     return torn <= 0.01 * covered
 
 
-def _say(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes: list[str]) -> None:
+def _add_notes(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes: list[str]) -> None:
     shared, mirrored = max(v.shared for v in verdicts), max(v.mirrored for v in verdicts)
     if instances:
         notes.append(
@@ -248,8 +252,8 @@ def _say(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes: list[
         )
     if shared > 0.005:
         notes.append(
-            f"Shells of material '{name}' lie on top of each other in UV space and share {shared:.0%} of its texels; "
-            "of each the one that comes first in the file is painted."
+            f"Shells of material '{name}' overlap in UV space and share {shared:.0%} of its texels; the first of them "
+            "in the file is painted."
         )
     if mirrored > 0.005:
         notes.append(f"{mirrored:.0%} of the UV area of material '{name}' is mirrored; it was kept as authored.")
@@ -293,7 +297,7 @@ def _lay_out(
 
 
 def _copy_to_instances(raw: Raw, uvs: Float[np.ndarray, "f 3 2"]) -> Float[np.ndarray, "f 3 2"]:
-    """Instances take their first instance's UVs; where one of the two is mirrored its corners are in another order."""
+    """Instances take their first instance's UVs; the corners of a mirrored one are in another order."""
     assert raw.twin is not None
     first = np.zeros(len(raw.faces), np.int64)
     for p in raw.primitives:
@@ -313,9 +317,9 @@ def _with_part(primitive, part: Int[np.ndarray, " f"]):
 def _material(
     raw: Raw, mesh: Mesh, part: int, source: RawMaterial, tile: int, all_carried: bool, size: int
 ) -> tuple[Material, list[str]]:
-    """The maps of a part's `source` in its working UVs, carried over where the file's lookup differs; and notes."""
-    maps, said = source.load(tile)
-    notes = list(said)
+    """The maps of a part's `source` in its working UVs, resampled where the file's lookup differs; and notes."""
+    maps, load_notes = source.load(tile)
+    notes = list(load_notes)
     rows = np.flatnonzero(mesh.part == part)
     plain = {name for name, entry in maps.items() if not all_carried and _is_plain(entry, raw.uvs, rows)}
     done = {
@@ -342,7 +346,7 @@ def _material(
         notes.append(
             f"The {name} map of material '{source.name}' was left out: its faces have no UVs to look it up at."
         )
-    made = Material(
+    result = Material(
         name=mesh.parts[part],
         albedo=albedo,
         normal=done.get("normal"),
@@ -356,11 +360,11 @@ def _material(
         specular=done.get("specular"),
         shading=shading,
     )
-    return made, notes
+    return result, notes
 
 
 def _is_plain(entry: RawMap, uvs: Float[np.ndarray, "f 3 2"] | None, rows: np.ndarray) -> bool:
-    """Whether a map is looked up at the mesh's UVs and repeats there."""
+    """Whether a map's lookup is the mesh's UVs with repeat wrapping."""
     if entry.uvs is not None or entry.transform is not None:
         return False
     lookup = None if entry.wrap == REPEAT else looked_up(entry, uvs, rows)
@@ -374,8 +378,8 @@ def _tinted(
     uvs: Float[np.ndarray, "f 3 2"],
     size: int,
 ) -> tuple[Float[np.ndarray, "h2 w2 c"] | None, Float[np.ndarray, " c"]]:
-    """Albedo (or opacity) and its factor, multiplied by the colours of the faces' corners. One colour for all goes into
-    the factor, others into a texture of `size` texels along a side, or more where the albedo has more."""
+    """Albedo (or opacity) and its factor, multiplied by the colours of the faces' corners. A uniform
+    colour goes into the factor, others into a texture of `size` texels a side, or more where the albedo has more."""
     if _one_colour(colours):
         return albedo, factor * (colours.min(axis=(0, 1)) + colours.max(axis=(0, 1))) / 2
     shape = _tinted_side(None if albedo is None else albedo.shape[:2], size)
@@ -386,7 +390,7 @@ def _tinted(
 
 
 def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, size: int) -> np.ndarray | None:
-    """One map carried over to the part's working UVs; None where there is nothing to look it up by."""
+    """One map resampled to the part's working UVs; None without lookup coordinates."""
     lookup = looked_up(entry, raw.uvs, rows)
     if lookup is None:
         return None
@@ -401,9 +405,9 @@ def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, si
 
 
 def _carried_side(entry: RawMap, lookup: Float[np.ndarray, "f 3 2"] | None, size: int) -> int:
-    """Texels along a side of a map that is carried over, `size` at most: as many as it has; where it repeats, as dense
-    on the surface as before; of a palette, which shows its faces a texel or less each, enough for the faces. The new
-    UVs are taken to cover a half of their square, since memory is foretold before they are there."""
+    """Texels a side of a resampled map, `size` at most: as many as it has. Where it repeats, it keeps its density on
+    the surface. A palette, with a texel or less a face, gets enough for the faces. The new UVs are assumed to cover
+    half of their square, since memory is estimated before they exist."""
     height, width = entry.values.shape[:2]
     side = max(height, width)
     if lookup is None or side >= size or (entry.values == entry.values[:1, :1]).all():

@@ -16,7 +16,7 @@ from mistyle.io.sandbox.bounds import read_bytes, refuse
 from mistyle.io.sandbox.nearby import unmarked
 
 AGAIN = "Export the mesh again"
-MAX_PADDING = 512  # bytes that programs and copies leave after the last face of an STL
+MAX_PADDING = 512  # bytes that some programs leave after the last face of an STL
 CUT_OFF = "The file is cut off or damaged; copy it again"
 
 
@@ -29,7 +29,7 @@ def plain_mesh(
     notes: Sequence[str] = (),
     colours: Float[np.ndarray, "f 3 3"] | None = None,
 ) -> Raw:
-    """A mesh of one plain material; `colours` are its corners' albedo, linear."""
+    """A mesh with one plain material; `colours` are its corners' albedo, linear."""
     return Raw(
         kind=kind,
         positions=np.ascontiguousarray(positions, np.float64),
@@ -46,8 +46,8 @@ def plain_mesh(
 
 def read_stl(path: Path, max_faces: int) -> Raw:
     """Binary or ASCII STL. The format repeats every vertex in every face: corners at bit-equal positions become one
-    vertex, numbered in order of appearance, and a note says so. Its facet normals are not used, and colours in its
-    attributes are not read; up to MAX_PADDING bytes after the last face are passed over."""
+    vertex, numbered in order of appearance, with a note. Facet normals and colours in the
+    attributes are not read; up to MAX_PADDING bytes after the last face are skipped."""
     data, notes = read_bytes(path), []
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     more = len(data) - (84 + 50 * count)
@@ -60,7 +60,7 @@ def read_stl(path: Path, max_faces: int) -> Raw:
         with np.errstate(invalid="ignore"):  # a signalling NaN in a damaged file
             corners = rows["corners"].reshape(-1, 3).astype(np.float64)
         if more:
-            notes.append(f"{more} byte(s) after the last face were passed over.")
+            notes.append(f"{more} byte(s) after the last face were ignored.")
         if b"COLOR=" in data[:80] or (rows["attribute"] & 0x8000).any():
             notes.append("Face colours (STL attributes) were not read.")
     elif text:
@@ -79,14 +79,14 @@ def read_stl(path: Path, max_faces: int) -> Raw:
     check_positions(corners, path)
     vertex = same_points(corners)
     first = np.unique(vertex, return_index=True)[1]
-    joined = f"{len(corners)} corners at equal positions were joined to {len(first)} vertices."
-    notes.append(f"STL repeats vertices in every face: {joined}")
+    welding = f"{len(corners)} corners at equal positions were joined to {len(first)} vertices."
+    notes.append(f"STL repeats vertices in every face: {welding}")
     return plain_mesh("stl", corners[first], vertex.reshape(-1, 3), notes=notes)
 
 
 def read_off(path: Path, max_faces: int) -> Raw:
-    """OFF, also with normals, colours or texture coordinates in its vertices (N, C and ST prefixes) and colours behind
-    its faces' indices. The counts may follow the word OFF without a space (ModelNet40)."""
+    """OFF, also with normals, colours or texture coordinates in its vertices (N, C and ST prefixes) and colours after
+    its faces' indices. The counts may follow OFF without a space (ModelNet40)."""
     data = re.sub(rb"#[^\r\n]*", b"", unmarked(read_bytes(path)))
     head = re.match(rb"\s*(ST)?(C)?(N)?(4)?(n)?(?:OFF|off)(?![A-Za-z_])[ \t]*(BINARY)?", data)
     if head is None or any(head.group(k) for k in (4, 5, 6)):

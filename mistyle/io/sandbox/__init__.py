@@ -1,1 +1,1 @@
-"""Strangers' files are decoded in a child process with bounds on what they may ask for."""
+"""Sandbox: untrusted files are decoded in a child process with limits on memory, time and file access."""

@@ -1,4 +1,4 @@
-"""How much a stranger's file may ask for, and from where."""
+"""Limits on untrusted files: sizes, counts, and the paths that they may reference."""
 
 import errno
 import re
@@ -14,17 +14,17 @@ USD = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 2 << 30
 MAX_JSON_BYTES = 64 << 20
 MAX_SETTINGS_BYTES = 4 << 20  # of a TOML or YAML file
-MAX_VALUES = 1_000_000  # in a TOML or YAML file, its aliases spelled out
+MAX_VALUES = 1_000_000  # in a TOML or YAML file, with aliases expanded
 MAX_DEPTH = 128  # of nested JSON and of the node graph
 MAX_NODES = 200_000
 MAX_PIXELS = 1 << 26  # of one picture: 8192 x 8192
 MAX_TEXTURE_PIXELS = 1 << 27  # of all textures of one mesh
 WORK_TEXTURE = 4096  # a mesh's own textures are halved until no side is longer
-READ_THREADS = 1  # that read one large file; the reader process takes more
+READ_THREADS = 1  # for one large file; the reader process uses more
 
 
 def refuse(path: Path | str, found: str, expected: str, fix: str) -> InputRefused:
-    """The sentence that every refusal has: which file, what was found, what was expected, what to do."""
+    """A refusal in the common form: file, content found, content expected, fix."""
     return InputRefused(f"{path}: found {found[:400]}; expected {expected[:800]}. {fix}")
 
 
@@ -40,8 +40,8 @@ def read_bytes(path: Path, limit: int | None = None, count: int = -1) -> bytes:
 
 def read_part(path: Path, start: int, count: int) -> memoryview:
     """`count` bytes of a file from `start` on, fewer where it ends before; READ_THREADS threads share the work."""
-    left = _check_size(path, None) - start
-    place = np.empty(max(min(count, left), 0), np.uint8).data
+    available = _check_size(path, None) - start
+    place = np.empty(max(min(count, available), 0), np.uint8).data
 
     def read(at: int, piece: memoryview) -> None:
         with open(path, "rb", buffering=0) as file:
@@ -80,32 +80,32 @@ def _unreadable(path: Path, error: OSError) -> InputRefused:
 def inside(folder: Path, name: str, where: Path, fix: str) -> Path:
     """The file of that name in `folder` or below, which need not exist; links are resolved before the check.
 
-    Every character of the name is a letter (a percent sign too), but backslashes separate folders. Raises InputRefused
+    The name is literal (a percent sign is a letter), but backslashes separate folders. Raises InputRefused
     for network addresses and everything that leads out of the folder; `where` is the file that names it.
     """
-    found = f"the file name {name[:120]!r}"
+    problem = f"the file name {name[:120]!r}"
     plain = name.replace("\\", "/")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", plain) or plain.startswith("//"):
-        raise refuse(where, found, "a relative file name (nothing is fetched)", fix)
+        raise refuse(where, problem, "a relative file name (nothing is fetched)", fix)
     if "\0" in plain or not plain:
-        raise refuse(where, found, "a file name", fix)
+        raise refuse(where, problem, "a file name", fix)
     root = folder.resolve()
     try:
         target = (root / plain).resolve()
     except (OSError, RuntimeError) as error:  # a loop of links
-        raise refuse(where, found, "a file name", fix) from error
+        raise refuse(where, problem, "a file name", fix) from error
     drive = re.match(r"[A-Za-z]:/", plain)
     if drive or not target.is_relative_to(root):
-        leads = "" if drive else f", which is {target}"
-        raise refuse(where, f"{found}{leads}", f"a file inside the folder {root}", fix)
+        suffix = "" if drive else f", which is {target}"
+        raise refuse(where, f"{problem}{suffix}", f"a file inside the folder {root}", fix)
     return target
 
 
 def beside(path: Path, reference: str) -> Path:
     """The file that `path` names, if it lies in the folder of `path` or below; links are resolved before the check.
 
-    A `path` that is a link has two folders, its own and that of the file it leads to; they are searched in this order.
-    Percent escapes are decoded as URIs have them (`inside` does not). Raises InputRefused for network addresses,
+    A `path` that is a link has two folders, its own and that of its target, searched in this order. Percent escapes are
+    decoded as in URIs (not in `inside`). Raises InputRefused for network addresses,
     absolute paths and everything that leads out of the folder (of both).
     """
     name = unquote(reference).replace("\\", "/")

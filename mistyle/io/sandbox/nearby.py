@@ -1,4 +1,4 @@
-"""Text and file names as other machines wrote them: byte-order marks, other encodings, paths of another disk."""
+"""Texts and file names from other machines: byte-order marks, other encodings, paths of another disk."""
 
 import os
 import re
@@ -10,14 +10,14 @@ from pathlib import Path
 from mistyle.core.errors import InputRefused
 from mistyle.io.sandbox.bounds import inside
 
-TEXTURES = "textures"  # the folder that archives of models have, in the mesh's folder or beside it
+TEXTURES = "textures"  # folder in archives of models, in the mesh's folder or beside it
 MARKS = ((b"\xef\xbb\xbf", "utf-8"), (b"\xff\xfe", "utf-16-le"), (b"\xfe\xff", "utf-16-be"))
-MAX_ENTRIES = 20_000  # of a folder that are looked at
+MAX_ENTRIES = 20_000  # entries of a folder that are searched
 FIX = "Copy the file into the mesh's folder and name it relative to the mesh"
 
 
 def unmarked(data: bytes) -> bytes:
-    """A text's bytes without a byte-order mark, which is not a letter; UTF-16 becomes UTF-8."""
+    """A text's bytes without a byte-order mark; UTF-16 becomes UTF-8."""
     for mark, encoding in MARKS:
         if data.startswith(mark):
             text = data[len(mark) :]
@@ -26,7 +26,7 @@ def unmarked(data: bytes) -> bytes:
 
 
 def decoded(*texts: bytes) -> tuple[list[str], bool]:
-    """Names from one file, and whether they are UTF-8: else all of them are taken as Windows-1252 or Latin-1."""
+    """Names from one file, and whether they are UTF-8; else all of them are decoded as Windows-1252 or Latin-1."""
     for encoding in ("utf-8", "cp1252"):
         try:
             return [text.decode(encoding) for text in texts], encoding == "utf-8"
@@ -36,19 +36,19 @@ def decoded(*texts: bytes) -> tuple[list[str], bool]:
 
 
 def mesh_folders(path: Path) -> tuple[Path, ...]:
-    """Where a mesh file's own names lead: its folder, then that of the file behind a link."""
+    """Folders of a mesh file's relative names: its own, then that of a link's target."""
     return tuple(dict.fromkeys((path.parent.resolve(), path.resolve().parent)))
 
 
 def named_file(
     where: Path, roots: Sequence[Path], name: str, *, picture: bool = True
 ) -> tuple[Path | None, str | None]:
-    """The file that `where` names, and the place where it was found if it was not where the name says.
+    """The file that `where` names, and its actual place if that differs from the name.
 
-    The name counts as it stands, relative to each folder of `roots`. Else its last parts are looked for there, upper
-    and lower case alike, and for a `picture` its last part in the folder `textures` of a root or beside it: the only
-    folder outside the roots that is ever opened. None where there is no such file. Raises InputRefused where there is
-    none and the name leads out of the roots.
+    The literal name is tried first, relative to each folder of `roots`. Then its last parts are searched there,
+    ignoring case. For a `picture`, its last part is also searched in the folder `textures` of a root or beside it: the
+    only folder outside the roots that is ever opened. None without such a file. Raises InputRefused where there is none
+    and the name leads out of the roots.
     """
     name = name.strip().strip('"')
     refused: InputRefused | None = None
@@ -61,15 +61,15 @@ def named_file(
         if target.is_file():
             return target, None
     for root in roots:
-        found = _found(root.resolve(), name, picture)
-        if found is not None:
-            return found, os.path.relpath(found, where.parent.resolve()).replace("\\", "/")
+        match = _search(root.resolve(), name, picture)
+        if match is not None:
+            return match, os.path.relpath(match, where.parent.resolve()).replace("\\", "/")
     if refused is not None:
         raise refused
     return None, None
 
 
-def _found(root: Path, name: str, picture: bool) -> Path | None:
+def _search(root: Path, name: str, picture: bool) -> Path | None:
     parts = [part for part in re.split(r"[/\\]", name) if part not in ("", ".", "..") and not part.endswith(":")]
     if not parts or "\0" in name:
         return None
@@ -78,7 +78,7 @@ def _found(root: Path, name: str, picture: bool) -> Path | None:
         folders = [_entry(root, TEXTURES), _entry(root.parent, TEXTURES)]
         places += [(folder, parts[-1:]) for folder in folders if folder is not None]
     for folder, tail in places:
-        # A link to a file outside is not followed: the folder itself was reached without one.
+        # Links to files outside are not followed.
         target = _walk(folder, tail)
         if target is not None and target.resolve().is_relative_to(folder) and target.is_file():
             return target.resolve()
@@ -86,19 +86,19 @@ def _found(root: Path, name: str, picture: bool) -> Path | None:
 
 
 def _walk(folder: Path, parts: Sequence[str]) -> Path | None:
-    here: Path | None = folder
+    current: Path | None = folder
     for part in parts:
-        here = _entry(here, part) if here is not None else None
-    return here
+        current = _entry(current, part) if current is not None else None
+    return current
 
 
 def _entry(folder: Path, name: str) -> Path | None:
-    """The entry of that name, else the only one that differs in case or Unicode form alone."""
+    """The entry of that name, else the only one that differs only in case or Unicode form."""
     names = _names(folder)
     if name in names:
         return folder / name
-    alike = [n for n in names if _folded(n) == _folded(name)]
-    return folder / alike[0] if len(alike) == 1 else None
+    matches = [n for n in names if _folded(n) == _folded(name)]
+    return folder / matches[0] if len(matches) == 1 else None
 
 
 def _folded(name: str) -> str:

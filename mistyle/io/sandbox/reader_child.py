@@ -1,9 +1,9 @@
-"""The process that decodes what strangers wrote: it reads requests from its input, answers on its output, ends with it.
+"""Reader process: decodes untrusted files; serves requests from stdin on stdout until stdin ends.
 
-Run by io/sandbox/reader_process.py as `python -m mistyle.io.sandbox.reader_child`. It may not write files (RLIMIT_FSIZE
-0, and an audit hook that refuses to open for writing, to remove, to start programs and to make sockets), its address
-space and processor time are limited anew for every request, and it leaves no core file. Without a `resource` module
-(Windows) only the audit hook holds. Interrupts and requests to end are the parent's business.
+io/sandbox/reader_process.py runs it as `python -m mistyle.io.sandbox.reader_child`. It may not write files
+(RLIMIT_FSIZE 0). An audit hook refuses to open for writing, to remove, to start programs and to make sockets. Every
+request gets new limits on address space and processor time. The process leaves no core file. Without a
+`resource` module (Windows) only the audit hook applies. The parent handles interrupts and stop requests.
 """
 
 import os
@@ -38,24 +38,22 @@ WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 def main() -> None:
     """Serve requests until the input ends."""
     requests, answers = os.fdopen(os.dup(0), "rb", buffering=0), os.dup(1)
-    nothing = os.open(os.devnull, os.O_RDWR)
-    os.dup2(nothing, 0)
-    os.dup2(nothing, 1)  # what a library prints must not get among the answers
-    for number in (signal.SIGINT, signal.SIGTERM):  # a whole group may get them; this process ends when its input does
+    devnull = os.open(os.devnull, os.O_RDWR)
+    os.dup2(devnull, 0)
+    os.dup2(devnull, 1)  # output of libraries must not mix with the answers
+    for number in (signal.SIGINT, signal.SIGTERM):  # may go to the whole group; this process ends when its input ends
         signal.signal(number, signal.SIG_IGN)
     import OpenEXR
 
     from mistyle.io.sandbox.reader_tasks import TASKS
 
-    # Several make up for the way of the pixels to the job's process.
+    # Several threads compensate for the transfer of the pixels to the job's process.
     OpenEXR.set_global_thread_count(min(cores(), MAX_THREADS))
     bounds.READ_THREADS = min(cores(), MAX_THREADS)
     base = _confine()
-    shown = np.frombuffer(
-        shared_copy.SIGN, np.uint8
-    )  # where the parent tries whether it can read this process's memory
-    rpc_codec.send(lambda data: os.write(answers, data), None, sign=shown.ctypes.data)
-    os.dup2(nothing, 2)
+    sign = np.frombuffer(shared_copy.SIGN, np.uint8)  # the parent tests here whether it can read this process's memory
+    rpc_codec.send(lambda data: os.write(answers, data), None, sign=sign.ctypes.data)
+    os.dup2(devnull, 2)
     while True:
         if resource is not None and not select.select([requests], [], [], IDLE)[0]:
             trim()
@@ -64,7 +62,7 @@ def main() -> None:
         except rpc_codec.BrokenMessage:
             return
         _limit(base + request["memory"], request["seconds"])
-        value, entries, done = _answer(TASKS[request["task"]], arguments, request)
+        value, entries, ending = _answer(TASKS[request["task"]], arguments, request)
         try:
             lent = rpc_codec.send(
                 lambda data: os.write(answers, data), value, request["may_lend"], peak=_peak(), **entries
@@ -74,13 +72,13 @@ def main() -> None:
             return
         except BrokenPipeError:
             return
-        if done or lent and not requests.read(1):  # what is lent stays until the parent says that it has it
+        if ending or lent and not requests.read(1):  # lent arrays stay until the parent confirms the copy
             return
         del value, lent
 
 
 def _answer(task: Any, arguments: tuple[Any, ...], request: dict[str, Any]) -> tuple[Any, dict[str, Any], bool]:
-    """The value, entries of the answer's header, and whether this process is not to go on."""
+    """The value, entries of the answer's header, and whether this process must end."""
     try:
         for module, values in request["limits"].items():
             for name, limit in values.items():
@@ -88,11 +86,11 @@ def _answer(task: Any, arguments: tuple[Any, ...], request: dict[str, Any]) -> t
         os.chdir(request["cwd"])
         return task(*arguments), {}, False
     except MistyleError as error:
-        # A decoder's own words about a failed allocation: memory is fragmented or short from now on.
+        # A decoder may wrap a failed allocation: memory is then fragmented or short.
         return None, {"refused": str(error), "kind": type(error).__name__}, _out_of_memory(error)
     except MemoryError:
         return None, {"memory": True}, True
-    except Exception as error:  # a hole in a reader must not reach the user as a traceback; tests look for this answer
+    except Exception as error:  # a reader's defect must not reach the user as a traceback; tests check for this answer
         first = (str(error).splitlines() or [""])[0][:120]
         return None, {"stumbled": f"{type(error).__name__}: {first}"}, False
 
@@ -106,7 +104,7 @@ def _out_of_memory(error: BaseException | None) -> bool:
 
 
 def _confine() -> int:
-    """Forbid writing for good; the address space in use now, in bytes."""
+    """Forbid writing permanently; returns the address space in use, in bytes."""
     sys.addaudithook(_audit)
     if resource is None:
         return 0
@@ -140,7 +138,7 @@ def _limit(memory: int, seconds: float) -> None:
 
 
 def _peak() -> int:
-    """The most memory held so far, bytes; 0 where nothing tells."""
+    """The peak memory so far, in bytes; 0 where unknown."""
     if resource is None:
         return 0
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

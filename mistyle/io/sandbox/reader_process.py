@@ -1,15 +1,13 @@
-"""The job's side of the border: one child process that opens and decodes what strangers wrote.
+"""Client of the reader process: one child process opens and decodes untrusted files.
 
-The child (io/sandbox/reader_child.py) is started once per process, when the first file is read or `start` is called,
-and serves one request after another, from whatever thread. What it decodes comes back as numbers
-(io/sandbox/rpc_codec.py). A file on which it crashes, hangs or runs out of memory is refused with a sentence; the next
-file gets a new child. A forked copy of this process starts a child of its own, and the child ends when its parent does,
-however that ends.
+The child (io/sandbox/reader_child.py) is started once per process, at the first file or by `start`. It serves one
+request after another, from any thread. It returns decoded values (io/sandbox/rpc_codec.py). A file on
+which it crashes, hangs or runs out of memory is refused with a sentence; the next file gets a new child. A forked copy
+of this process starts its own child. The child ends with its parent, however that ends.
 
 Limits per file, in the child: address space MEMORY and 64 bytes for every byte of the file, processor time SECONDS and
-SECONDS_PER_MIB, no file may be written; from here: wall-clock time PATIENCE times as long as the processor time. Where
-the system has no `resource` module (Windows) only the wall-clock limit holds, and macOS does not enforce the limit on
-memory.
+SECONDS_PER_MIB, no file may be written. The client limits the wall-clock time to PATIENCE times the processor time.
+Without a `resource` module (Windows) only the wall-clock limit applies, and macOS does not enforce the limit on memory.
 """
 
 import atexit
@@ -35,7 +33,7 @@ SECONDS_PER_MIB = 4.0
 PATIENCE = 4.0
 AGAIN = "Write it again, best with another program"
 WHOLE = "a file that can be decoded"
-# Modules of mistyle/io whose bounds (MAX_..., WORK_...) hold in the child as they stand here.
+# Modules of mistyle/io whose bounds (MAX_..., WORK_...) the child copies from this process.
 BOUNDED = (
     "sandbox.bounds",
     "images.read",
@@ -48,7 +46,7 @@ BOUNDED = (
     "cameras.camera_files",
 )
 PIPE_BYTES = 1 << 20
-KEPT = 256 << 20  # bytes that the child may hold for the next file
+KEPT = 256 << 20  # bytes of free heap that the child may retain for the next file
 F_SETPIPE_SZ = 1031  # fcntl.h of Linux; Python has the name only since 3.10 and only there
 
 _lock = threading.Lock()
@@ -56,19 +54,24 @@ _reader: "Reader | None" = None
 
 
 class OutOfMemory(Exception):
-    """The child asked for more address space than it may have."""
+    """The child exceeded its limit on address space."""
 
 
 class Reader:
-    """A running child (state: it outlives the calls). `peak` is the most memory it has held, in bytes."""
+    """A running child (state across calls). `peak` is its peak memory in bytes."""
 
     def __init__(self) -> None:
         paths = os.pathsep.join(p for p in (str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")) if p)
-        # One thread each and few heaps: all of them reserve address space, which is limited.
-        alone = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
-        # glibc: blocks that one file gave back serve the next, which else waits for the system to clear new pages. What
-        # is free goes back when no file follows (reader_child.py).
-        alone |= {"MALLOC_MMAP_THRESHOLD_": str(KEPT // 4), "MALLOC_TRIM_THRESHOLD_": str(KEPT)}
+        # One thread per library and few heaps: each reserves address space, which is limited.
+        limits_env = {
+            "OPENBLAS_NUM_THREADS": "1",
+            "OMP_NUM_THREADS": "1",
+            "MKL_NUM_THREADS": "1",
+            "MALLOC_ARENA_MAX": "2",
+        }
+        # glibc: freed blocks are reused for the next file, which else waits for the system to clear new pages. They are
+        # returned when no file follows (reader_child.py).
+        limits_env |= {"MALLOC_MMAP_THRESHOLD_": str(KEPT // 4), "MALLOC_TRIM_THRESHOLD_": str(KEPT)}
         try:
             self.process = subprocess.Popen(
                 [sys.executable, "-B", "-m", "mistyle.io.sandbox.reader_child"],
@@ -76,7 +79,7 @@ class Reader:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 bufsize=0,
-                env={**os.environ, "PYTHONPATH": paths, **alone},
+                env={**os.environ, "PYTHONPATH": paths, **limits_env},
             )
         except OSError as error:
             raise EnvironmentMissing(
@@ -90,23 +93,23 @@ class Reader:
         _widen(self.output.fileno())
 
     def wait_ready(self) -> None:
-        """Until the child has loaded its decoders. Raises EnvironmentMissing with its last words where it cannot."""
+        """Wait until the child has loaded its decoders. Raises EnvironmentMissing with its last message on failure."""
         if self.ready:
             return
         try:
             _, head = rpc_codec.receive(self.output.readinto)  # type: ignore[attr-defined]
         except rpc_codec.BrokenMessage as error:
-            said = self.stderr.read().decode("utf-8", "replace").strip().splitlines()[-1:] or ["no message"]
+            message = self.stderr.read().decode("utf-8", "replace").strip().splitlines()[-1:] or ["no message"]
             self.close()
             raise EnvironmentMissing(
-                f"the process that reads files did not start ({said[0][:300]}); run `python -m mistyle doctor`"
+                f"the process that reads files did not start ({message[0][:300]}); run `python -m mistyle doctor`"
             ) from error
         self.lends = shared_copy.can_read(self.process.pid, int(head.get("sign", 0)))
         self.ready = True
 
     def ask(self, path: Path, task: str, arguments: tuple[Any, ...], size: int) -> Any:
-        """What the task gives for the file; see the function `ask`. After OutOfMemory, and after any other end than an
-        answer, the child is gone."""
+        """The task's result for the file; see the function `ask`. After OutOfMemory, and after any failure without an
+        answer, the child has ended."""
         memory, seconds = MEMORY + MEMORY_PER_BYTE * size, SECONDS + SECONDS_PER_MIB * size / 2**20
         late, self.borrowed = threading.Event(), False
 
@@ -126,7 +129,7 @@ class Reader:
                 self.input.write(b"\0")
         except (rpc_codec.BrokenMessage, OSError) as error:
             raise refuse(path, self._end(late.is_set(), PATIENCE * seconds, seconds), WHOLE, AGAIN) from error
-        except BaseException:  # an interrupt amid an answer: the rest of it must not be taken for the next one
+        except BaseException:  # an interrupt within an answer: the rest of it must not be read as the next one
             self.close(kill=True)
             raise
         finally:
@@ -148,7 +151,7 @@ class Reader:
         shared_copy.copy_from(self.process.pid, address, place)
 
     def _end(self, late: bool, patience: float, seconds: float) -> str:
-        """What became of the child that sent no answer."""
+        """The reason why the child sent no answer."""
         self.close(kill=late)
         code = self.process.returncode
         if late:
@@ -175,14 +178,14 @@ class Reader:
 
 
 def ask(task: str, path: Path, *arguments: Any) -> Any:
-    """What `task` (io/sandbox/reader_tasks.py) makes of the file at `path`, decoded in the child.
+    """The result of `task` (io/sandbox/reader_tasks.py) for the file at `path`, decoded in the child.
 
-    Raises what the task raises (InputRefused and its kin, with their sentences), InputRefused where the child crashed,
-    hung or ran out of memory over the file, EnvironmentMissing where no child can be started.
+    Raises the task's own errors (InputRefused and related, with their messages). InputRefused where the child crashed,
+    hung or ran out of memory over the file; EnvironmentMissing where no child can be started.
     """
     size = _size(path)
     with _lock:
-        # A child that has served before may hold memory in pieces: then a new one is asked once more.
+        # A child that has served before may have fragmented memory: the request is repeated in a new one.
         for fresh in (_running().served == 0, True):
             try:
                 return _running().ask(path, task, arguments, size)
@@ -200,7 +203,7 @@ def start() -> None:
 
 
 def peak_bytes() -> int:
-    """The most memory that the present child has held; 0 where there is none, or nothing tells."""
+    """The peak memory of the current child in bytes; 0 without a child or where unknown."""
     return _reader.peak if _reader is not None else 0
 
 
@@ -214,7 +217,7 @@ def stop() -> None:
 
 
 def _at_exit() -> None:
-    """A daemon thread may be amid a request for good: then its child is killed, and not waited for the lock."""
+    """Stop the child. If a daemon thread holds the lock in a pending request, kill the child without the lock."""
     if _lock.acquire(timeout=1.0):
         _lock.release()
         stop()
@@ -239,17 +242,17 @@ def _running() -> Reader:
 
 
 def _bounds() -> dict[str, dict[str, int]]:
-    """The bounds as they stand in this process, so that the child keeps the same."""
-    found = {}
+    """The bounds of this process, for the child."""
+    bounds = {}
     for name in BOUNDED:
         module = sys.modules.get(f"mistyle.io.{name}")
         if module is not None:
-            found[name] = {k: v for k, v in vars(module).items() if k.startswith(("MAX_", "WORK_"))}
-    return found
+            bounds[name] = {k: v for k, v in vars(module).items() if k.startswith(("MAX_", "WORK_"))}
+    return bounds
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file, or of all files in a folder; a mesh's text may lean on other files in its folder."""
+    """Bytes of a file, or of all files in a folder; text formats of meshes may refer to other files in their folder."""
     several = path.is_dir() or path.suffix.lower() in (".gltf", ".obj")
     folder = path if path.is_dir() else path.parent
     try:
@@ -257,11 +260,11 @@ def _size(path: Path) -> int:
             return min(sum(entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()), MAX_FILE_BYTES)
         return min(path.stat().st_size, MAX_FILE_BYTES)
     except OSError:
-        return 0  # the task itself says what is wrong with the file
+        return 0  # the task itself refuses the file with a reason
 
 
 def _widen(handle: int) -> None:
-    """A larger pipe: arrays go through it in fewer turns. Refused beyond the user's share, which costs only speed."""
+    """Enlarge the pipe, so that arrays need fewer writes. A refusal beyond the user's quota costs only speed."""
     if sys.platform == "linux":
         import fcntl
 
@@ -270,7 +273,8 @@ def _widen(handle: int) -> None:
 
 
 def _forget() -> None:
-    """In a forked copy: the child belongs to the parent; its pipes are closed here so that they can end there."""
+    """In a forked copy the child belongs to the parent: close its pipes here, so that the parent's close takes
+    effect."""
     global _lock, _reader
     _lock = threading.Lock()
     if _reader is not None:

@@ -1,7 +1,7 @@
-"""What the reader process can be asked to do, by name: each task opens, checks and decodes one file (or folder).
+"""Tasks of the reader process, by name: each opens, checks and decodes one file (or folder).
 
-The first argument is the file's path, all arguments and results are what io/sandbox/rpc_codec.py can send. Nothing here
-is called in the job's own process.
+The first argument is the file's path; io/sandbox/rpc_codec.py must support all arguments and results. The job's own
+process never calls these functions.
 """
 
 import tomllib
@@ -37,21 +37,21 @@ def mesh(path: Path, reader: str, max_faces: int) -> Raw | Indexed:
     if not module.startswith("mistyle.io."):
         raise ValueError(f"{reader} is not a reader of mistyle")
     with _usd(path):
-        found: Raw | Indexed = getattr(import_module(module), function)(path, max_faces)
-        raw = found.raw if isinstance(found, Indexed) else found
+        parsed: Raw | Indexed = getattr(import_module(module), function)(path, max_faces)
+        raw = parsed.raw if isinstance(parsed, Indexed) else parsed
         if len(raw.faces) == 0:
             raise refuse(path, "no triangles", "at least one", "Export the mesh with its faces")
-        # glTF, whose UVs are no part of `raw` yet, has no tiles.
+        # glTF, whose UVs are not yet part of `raw`, has no tiles.
         uvs = raw.uvs
         tiled = [uvs[raw.material == k] if m.udim and uvs is not None else None for k, m in enumerate(raw.materials)]
         pairs = zip(raw.materials, tiled, strict=True)
         raw = replace(raw, materials=tuple(replace(m, load=Textures(_tiles(m, uv))) for m, uv in pairs))
-        return replace(found, raw=raw) if isinstance(found, Indexed) else raw
+        return replace(parsed, raw=raw) if isinstance(parsed, Indexed) else raw
 
 
 @contextmanager
 def _usd(path: Path) -> Iterator[None]:
-    """USD's own exceptions, and those of the archive and the text that it is read from, as refusals."""
+    """Convert exceptions of USD, of the archive and of the text to refusals."""
     if not path.suffix.lower().startswith(".usd"):
         yield
         return
@@ -64,23 +64,23 @@ def _usd(path: Path) -> Iterator[None]:
 
 
 def _tiles(material: RawMaterial, uvs: Float[np.ndarray, "f 3 2"] | None) -> dict[int, Tile]:
-    """The textures of every tile that a face could lie in; that of 1001 is asked for where the UVs are no tiles."""
+    """The textures of every tile that may contain a face; tile 1001 where the UVs are not tiled."""
     numbers = {1001}
     if material.udim and uvs is not None:
         corners = uvs[np.isfinite(uvs).all(axis=-1)]
         u, v = np.unique(np.floor(np.clip(corners, -1, TILES)).astype(np.int64), axis=0).T
         inside = (u >= 0) & (u < TILES) & (v >= 0) & (v < TILES)
         numbers |= {int(n) for n in (1001 + u + 10 * v)[inside]}
-    done: dict[int, Tile] = {}
+    loaded: dict[int, Tile] = {}
     for number in sorted(numbers):
         try:
             maps, notes = material.load(number)
-            done[number] = Tile(dict(maps), tuple(notes))
+            loaded[number] = Tile(dict(maps), tuple(notes))
         except InputRefused as error:
             if number == 1001 and len(numbers) == 1:
                 raise
-            done[number] = Tile({}, (), str(error))  # counts only if a face turns out to lie in that tile
-    return done
+            loaded[number] = Tile({}, (), str(error))  # raised only if a face lies in that tile
+    return loaded
 
 
 def exr(path: Path) -> dict[str, np.ndarray]:
@@ -122,13 +122,13 @@ def npy(path: Path) -> np.ndarray:
     if read_bytes(path, count=6) != b"\x93NUMPY":
         raise refuse(path, "no NumPy header", "an .npy file of numbers", AGAIN)
     try:
-        # Mapped: a header that announces more than the file holds is refused before memory is asked for.
-        found = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
+        # Mapped: a header that declares more data than the file holds is refused before allocation.
+        array = np.array(np.load(path, mmap_mode="r", allow_pickle=False))
     except (ValueError, OSError, EOFError, KeyError, TypeError, OverflowError, SyntaxError, TokenError) as error:
         raise refuse(path, f"no array ({str(error)[:100]})", "an .npy file of numbers", AGAIN) from error
-    if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiub":
-        raise refuse(path, f"{getattr(found, 'dtype', type(found).__name__)}", "an array of numbers", AGAIN)
-    return found.astype(found.dtype.newbyteorder("="), copy=False)
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+        raise refuse(path, f"{getattr(array, 'dtype', type(array).__name__)}", "an array of numbers", AGAIN)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
 def json(path: Path) -> Json:
@@ -177,8 +177,8 @@ def _text(path: Path, expected: str) -> str:
 
 
 def plain(tree: Any, path: Path) -> Any:
-    """The tree, if it holds numbers, texts, truth values, lists and tables only, not too many (a YAML alias may repeat
-    a value millions of times over) and not nested deeper than MAX_DEPTH."""
+    """The tree, if it holds only numbers, texts, truth values, lists and tables. At most MAX_VALUES (a YAML alias may
+    repeat a value millions of times), nested at most MAX_DEPTH deep."""
     level, count = [tree], 0
     for _ in range(MAX_DEPTH):
         below: list[Any] = []

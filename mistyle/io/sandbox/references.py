@@ -1,4 +1,4 @@
-"""Which other files a mesh file names: material libraries, textures, buffers, images."""
+"""Files that a mesh file references: material libraries, textures, buffers, images."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -14,27 +14,27 @@ from mistyle.io.sandbox.nearby import mesh_folders, named_file, unmarked
 
 
 def references(path: Path) -> list[Path]:
-    """The files that an .obj, .ply or .gltf file names, that exist and that its reader opens; others name none.
+    """The files that an .obj, .ply or .gltf file names, that exist and that its reader opens; none for other formats.
 
-    A file that cannot be read names none: the reader refuses it, with the sentence that explains it.
+    None for an unreadable file: its reader refuses it with the reason.
     """
     kind = path.suffix.lower()
     try:
-        named = NAMED[kind](path) if kind in NAMED else []
+        files = NAMED[kind](path) if kind in NAMED else []
     except InputRefused:
         return []
-    return sorted({file for file in named if file.is_file()})
+    return sorted({file for file in files if file.is_file()})
 
 
 def _of_obj(path: Path) -> list[Path]:
-    words = (line.split(None, 1) for line in unmarked(read_bytes(path)).splitlines())
-    named = [line[1].strip() for line in words if len(line) == 2 and line[0] == b"mtllib"]
-    libraries = library_files(named, path)[0]
+    statements = (line.split(None, 1) for line in unmarked(read_bytes(path)).splitlines())
+    library_names = [line[1].strip() for line in statements if len(line) == 2 and line[0] == b"mtllib"]
+    libraries = library_files(library_names, path)[0]
     return libraries + [texture for library in libraries for texture in _of_library(library, path)]
 
 
 def _of_library(library: Path, path: Path) -> list[Path]:
-    found: list[Path] = []
+    files: list[Path] = []
     for entry in read_library(library, path)[0].values():
         for key in NAMING & set(entry.values):
             file = statement(entry.values[key]).file
@@ -42,18 +42,18 @@ def _of_library(library: Path, path: Path) -> list[Path]:
             with suppress(InputRefused):
                 target = named_file(library, entry.roots, first or file)[0]
                 if target is not None:
-                    found += [target] if first is None else target.parent.glob(target.name.replace("1001", "1???"))
-    return found
+                    files += [target] if first is None else target.parent.glob(target.name.replace("1001", "1???"))
+    return files
 
 
 def _of_ply(path: Path) -> list[Path]:
     header = read_bytes(path, count=MAX_HEADER).partition(b"end_header")[0]
-    found: list[Path] = []
+    files: list[Path] = []
     for name in texture_files(header):
         with suppress(InputRefused):
             target = named_file(path, mesh_folders(path), name)[0]
-            found += [] if target is None else [target]
-    return found
+            files += [] if target is None else [target]
+    return files
 
 
 def _of_gltf(path: Path) -> list[Path]:

@@ -1,9 +1,9 @@
-"""How values travel between the reader process and the job: a JSON tree and the raw bytes of its arrays, no pickle.
+"""Message codec between the reader process and the job: a JSON tree and the raw bytes of its arrays, no pickle.
 
 A message is eight bytes of length (little endian), a JSON header, then each array's bytes in the order of the header's
 table [dtype, shape]; or [dtype, shape, address] for large arrays that the receiver copies from the sender's memory
 (io/sandbox/shared_copy.py). Only plain values, arrays of numbers and the records in RECORDS can be in it, and the
-receiving side builds nothing else: a process that a hostile file has taken over can send wrong numbers, but no code.
+receiver builds nothing else: a process under a hostile file's control can send wrong numbers, but no code.
 """
 
 import importlib
@@ -19,7 +19,7 @@ import numpy as np
 from mistyle.io.sandbox.shared_copy import LENT
 from mistyle.io.store.record_tree import from_tree, to_tree
 
-# Records that may be sent, by the name they have on the way. A reader that returns another record adds it here.
+# Records that may be sent, by their name in messages. A reader that returns another record adds it here.
 RECORDS = {
     "Picture": "mistyle.core.asset:Picture",
     "Primitive": "mistyle.core.asset:Primitive",
@@ -45,12 +45,12 @@ DTYPE = re.compile(r"[<>|][?biuf](1|2|4|8|16)")
 
 
 class BrokenMessage(Exception):
-    """The other side is gone, or sent what no message is."""
+    """The other side has ended, or sent an invalid message."""
 
 
 @dataclass(frozen=True)
 class Json:
-    """A value that JSON has: it is sent as it is, without a walk through all its parts."""
+    """A JSON value, sent unchanged and without a traversal."""
 
     tree: Any
 
@@ -63,7 +63,7 @@ Copy = Callable[[int, memoryview], None]  # from an address in the sender's memo
 def send(write: Write, value: Any, lend: bool = False, **entries: Any) -> list[np.ndarray]:
     """Write one message: `value`, and plain `entries` of its header.
 
-    With `lend`, large arrays are not written but returned: they must live until the other side says that it has them.
+    With `lend`, large arrays are not written but returned: they must live until the other side confirms the copy.
     """
     arrays: list[np.ndarray] = []
     seen: dict[int, int] = {}
@@ -95,7 +95,7 @@ def receive(read: Read, copy: Copy | None = None) -> tuple[Any, dict[str, Any]]:
         if address is None:
             _fill(read, place)
         elif copy is None:
-            raise BrokenMessage("an array that was lent to no one")
+            raise BrokenMessage("a lent array without a copy function")
         else:
             copy(address, place)
     try:
@@ -138,7 +138,7 @@ def _allowed(table: Iterable[Any]) -> list[tuple[str, tuple[int, ...], int | Non
 
 
 def _pack(value: Any, arrays: list[np.ndarray], seen: dict[int, int]) -> Any:
-    """The tree of a value, whose arrays are added to `arrays`, each once."""
+    """The tree of a value; its arrays are added to `arrays`, each once."""
 
     def leaf(value: Any) -> dict[str, Any] | None:
         if isinstance(value, np.ndarray):
@@ -166,7 +166,7 @@ def _name(value: Any) -> str:
 
 
 def _unpack(tree: Any, arrays: list[np.ndarray]) -> Any:
-    """The value of a tree, built of the records in RECORDS alone."""
+    """The value of a tree, built only of the records in RECORDS."""
 
     def leaf(kind: str, value: Any) -> Any:
         if kind == "array":
@@ -181,5 +181,5 @@ def _unpack(tree: Any, arrays: list[np.ndarray]) -> Any:
 
 
 def _class(name: str) -> type:
-    module, _, found = RECORDS[name].partition(":")
-    return getattr(importlib.import_module(module), found)
+    module, _, attribute = RECORDS[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)

@@ -1,8 +1,8 @@
-"""Memory of the reader process copied straight into the job's (Linux): one copy, where a pipe needs two and many turns.
+"""Direct copy from the reader process's memory to the job's (Linux): one copy; a pipe needs two and many writes.
 
 `process_vm_readv` reads the memory of a process that this one may trace, as a parent may its child under Yama's usual
-setting. Where a system does not allow it the pipe carries everything. What is copied can no longer change: a page
-shared between the two could be altered after it was checked.
+setting. Without this permission the pipe transfers all arrays. A copy cannot change after its check, unlike a page
+shared between the two processes.
 """
 
 import ctypes
@@ -13,7 +13,7 @@ from typing import Any
 from mistyle.process.cores import in_pieces
 
 SIGN = b"mistyle reader  "
-LENT = 1 << 18  # arrays of so many bytes are lent, smaller ones are sent
+LENT = 1 << 18  # bytes: larger arrays are lent, smaller ones are sent
 MAX_THREADS = 4
 
 
@@ -36,18 +36,18 @@ def _call() -> Any:
 
 
 def can_read(process: int, address: int) -> bool:
-    """Whether that process's memory can be read: SIGN stands at the address."""
-    found = bytearray(len(SIGN))
+    """Whether that process's memory can be read: whether SIGN is at the address."""
+    buffer = bytearray(len(SIGN))
     try:
-        copy_from(process, address, memoryview(found))
+        copy_from(process, address, memoryview(buffer))
     except OSError:
         return False
-    return bytes(found) == SIGN
+    return bytes(buffer) == SIGN
 
 
 def copy_from(process: int, address: int, into: memoryview) -> None:
-    """Fill `into` with the bytes at `address` of that process, on several threads where they are many. Raises OSError
-    where that is not allowed or there are none."""
+    """Fill `into` with the bytes at `address` of that process, on several threads if they are many. Raises OSError
+    where this is not permitted or the bytes do not exist."""
     in_pieces(into, lambda at, piece: _copy(process, address + at, piece), MAX_THREADS)
 
 
@@ -55,10 +55,10 @@ def _copy(process: int, address: int, into: memoryview) -> None:
     call = _call()
     if call is None:
         raise OSError("this system does not read another process's memory")
-    here, done = ctypes.addressof(ctypes.c_char.from_buffer(into)), 0
+    base, done = ctypes.addressof(ctypes.c_char.from_buffer(into)), 0
     while done < len(into):
-        left = len(into) - done
-        count = call(process, Span(here + done, left), 1, Span(address + done, left), 1, 0)
+        remaining = len(into) - done
+        count = call(process, Span(base + done, remaining), 1, Span(address + done, remaining), 1, 0)
         if count <= 0:
             number = ctypes.get_errno()
             raise OSError(number, os.strerror(number))

@@ -1,1 +1,1 @@
-"""Files that are whole or absent: atomic writes, locks, hashes, records, output folders."""
+"""Storage on disk: atomic writes, locks, hashes, records, output folders."""

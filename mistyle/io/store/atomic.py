@@ -1,7 +1,7 @@
-"""Files that are whole or not there: atomic writes, content hashes, and the markers of finished folders.
+"""Atomic writes of files and folders, content hashes, and the markers of finished folders.
 
-Everything is written under a hidden temporary name beside its place (`.<name>.tmp-<host>-<pid>-<n>`), flushed to the
-disk and then renamed. A run that is killed at any moment leaves only such names behind; the next run removes them.
+Every file is written under a hidden temporary name beside its target (`.<name>.tmp-<host>-<pid>-<n>`), flushed to the
+disk and then renamed. A killed run leaves only such names; the next run removes them.
 """
 
 import contextlib
@@ -30,17 +30,17 @@ _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>tmp|old)-(?P<host>.+)-(?P<pid>
 
 
 def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
-    """Write a file so that it is seen either whole or not at all.
+    """Write a file atomically: a reader sees the whole file or none.
 
-    `data` is the content, or a function that writes it to the temporary path it is given (same folder, same suffix). A
-    disk that is full, not to be written or gone raises MistyleError (`process/disk_errors.py`) and leaves neither the
-    file nor a temporary one; any other error passes through.
+    `data` is the content, or a function that writes it to a temporary path (same folder, same suffix). A disk that is
+    full, read-only or missing raises MistyleError (`process/disk_errors.py`) and leaves neither the file nor a
+    temporary one; any other error passes through.
     """
     temporary = hidden(path, next(COUNTER), "tmp", path.suffix)
-    with disk_errors.told(path):
+    with disk_errors.translated(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with disk_errors.told(path, temporary):
+        with disk_errors.translated(path, temporary):
             if callable(data):
                 data(temporary)
             else:
@@ -56,24 +56,24 @@ def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
 def atomic_folder(
     target: Path, write: Callable[[Path], object], put: Callable[[Path, Path, Path], None] | None = None
 ) -> None:
-    """Fill a new folder by `write(folder)` and put it at `target`, in the place of an older one, when it is complete.
+    """Fill a new folder by `write(folder)`; once complete, it replaces the folder at `target`.
 
-    For folders that are mistyle's alone (checkpoints): all that an older one holds goes. Folders in which a user may
-    have files are `output.put_folder`'s and `output.replace_files`'s.
+    Only for folders that no user shares (checkpoints): all files of the older one are deleted. Use `output.put_folder`
+    or `output.replace_files` for folders with a user's files.
 
-    The older folder stays until then. Between the two renames of the swap `target` is absent for an instant; a run
-    killed just there is mended by the next call (or the next Keeper) for the same place. `put(new, target, old)` may
-    bring the new folder in otherwise than by `swap`.
+    The older folder stays until then. Between the two renames of the swap `target` is absent for an instant; the next
+    call (or the next Keeper) for the same target repairs a run killed in between. `put(new, target, old)` replaces
+    `swap`.
     """
     target = Path(os.path.realpath(target))  # a link to a folder elsewhere stays a link
     count = next(COUNTER)
     temporary, old = hidden(target, count, "tmp"), hidden(target, count, "old")
-    with disk_errors.told(target):
+    with disk_errors.translated(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         clean_leftovers(target.parent, name=target.name)
         temporary.mkdir()
     try:
-        with disk_errors.told(target, temporary):
+        with disk_errors.translated(target, temporary):
             write(temporary)
             flush_all(temporary)
             (put or swap)(temporary, target, old)
@@ -83,33 +83,33 @@ def atomic_folder(
 
 
 def swap(temporary: Path, target: Path, old: Path) -> None:
-    with contextlib.suppress(FileNotFoundError):  # none there, or another run has just taken it away
+    with contextlib.suppress(FileNotFoundError):  # absent, or another run has just removed it
         os.rename(target, old)
     try:
         os.rename(temporary, target)
     except OSError:
-        with contextlib.suppress(OSError):  # where another run's folder stands by now, that one stays
+        with contextlib.suppress(OSError):  # another run's folder may exist by now; it stays
             os.rename(old, target)
         raise
     shutil.rmtree(old, ignore_errors=True)
 
 
 def clean_leftovers(folder: Path, *, name: str | None = None, everyones: bool = False) -> None:
-    """Remove what killed runs left in a folder (not below it): temporary files and folders, half-done swaps.
+    """Remove leftovers of killed runs in a folder (not below it): temporary files and folders, incomplete swaps.
 
-    Only names of the pattern of this module are touched (with `name`: only those of this target), and only those of
-    processes of this host that are no longer alive, unless `everyones` (for the holder of the folder's lock).
+    Only names of this module's pattern are removed (with `name`: only those of this target). Only names of dead
+    processes of this host are removed, unless `everyones` is set (for the holder of the folder's lock).
     """
     matches = [(_LEFTOVER.fullmatch(p.name), p) for p in sorted(folder.glob(".*"))]
-    found = [(m, p) for m, p in matches if m and name in (None, m["name"])]
-    for match, path in found:
-        here, pid, target = match["host"] == lock.this_host(), int(match["pid"]), folder / match["name"]
-        if (here and pid == os.getpid()) or not (everyones or (here and not lock.alive(pid))) or not path.exists():
+    leftovers = [(m, p) for m, p in matches if m and name in (None, m["name"])]
+    for match, path in leftovers:
+        local, pid, target = match["host"] == lock.this_host(), int(match["pid"]), folder / match["name"]
+        if (local and pid == os.getpid()) or not (everyones or (local and not lock.alive(pid))) or not path.exists():
             continue
         if match["kind"] == "old" and not target.exists():
             # Killed between the two renames of a swap: the new folder is complete and still has its temporary name.
             swap = match.group("name", "host", "pid", "n")
-            new = [p for m, p in found if m["kind"] == "tmp" and m.group("name", "host", "pid", "n") == swap]
+            new = [p for m, p in leftovers if m["kind"] == "tmp" and m.group("name", "host", "pid", "n") == swap]
             os.rename(new[0] if new else path, target)
         if not path.exists():
             continue
@@ -129,7 +129,7 @@ def digest(obj: object) -> str:
     """A hash (64 hexadecimal digits) of settings and inputs that is the same in every process.
 
     Takes pydantic models, dataclasses, enums, mappings, lists, tuples, sets, arrays (dtype, shape and bytes), bytes
-    and JSON's own values. A Path that names a file or folder counts by its content, not by where it lies; any other
+    and JSON's own values. A Path that names a file or folder counts by its content, not by its location; any other
     Path counts by its text. Files that a file refers to (textures of a mesh) do not count: pass them too.
     Raises TypeError for anything else.
     """
@@ -169,39 +169,39 @@ def _plain(obj: object) -> object:
     raise TypeError(f"cannot make a stable hash of a {type(obj).__name__}; pass numbers, text, paths, arrays, records")
 
 
-def seal(folder: Path, **told: object) -> None:
-    """Write the marker of a finished folder: what is told, and the sha256 of every file in it."""
+def seal(folder: Path, **values: object) -> None:
+    """Write the marker of a finished folder: `values`, and the sha256 of every file in it."""
     hashes = {p.relative_to(folder).as_posix(): sha256_file(p) for p in _files(folder)}
-    text = json.dumps({**told, "files": hashes}, indent=1, sort_keys=True) + "\n"
+    text = json.dumps({**values, "files": hashes}, indent=1, sort_keys=True) + "\n"
     (folder / DONE).write_text(text, encoding="utf-8")
 
 
 def intact(folder: Path, editable: Callable[[str], bool] = lambda name: False) -> set[str] | None:
-    """The files that a sealed folder was finished with, marker included; None when one is missing or changed.
+    """The files that a sealed folder lists, marker included; None when one is missing or changed.
 
     Files whose names are `editable` may have changed.
     """
-    found = done(folder)
-    if found is None:
+    marker = done(folder)
+    if marker is None:
         return None
     whole = all(
         (folder / name).is_file() and (editable(name) or sha256_file(folder / name) == value)
-        for name, value in found[1].items()
+        for name, value in marker[1].items()
     )
-    return {DONE, *found[1]} if whole else None
+    return {DONE, *marker[1]} if whole else None
 
 
 def done(folder: Path) -> tuple[str, dict[str, str]] | None:
-    """Key and hashes of a finished stage's marker; None when there is no readable one."""
+    """Key and hashes of a finished stage's marker; None without a readable one."""
     try:
-        found = read_own(folder / DONE)
-        return str(found["key"]), {str(k): str(v) for k, v in found["files"].items()}
+        marker = read_own(folder / DONE)
+        return str(marker["key"]), {str(k): str(v) for k, v in marker["files"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
 def notes_of(folder: Path) -> list[str]:
-    """The sentences in a finished stage's marker; none where there is no readable one."""
+    """The sentences in a finished stage's marker; empty without a readable one."""
     try:
         return [str(text) for text in read_own(folder / DONE).get("notes", [])]
     except (OSError, ValueError, AttributeError, TypeError):
@@ -217,7 +217,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def flush_all(folder: Path) -> None:
-    """Bring a folder's files and folders to the disk."""
+    """Flush a folder's files and folders to the disk."""
     for path in _files(folder):
         flush(path)
     for place in [*(p for p in sorted(folder.rglob("*")) if p.is_dir()), folder]:

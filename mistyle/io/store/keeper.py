@@ -1,4 +1,4 @@
-"""The keeper of finished stages: each a folder under a key, in a folder where one process at a time works."""
+"""The store of finished stages: a folder per stage, identified by a key, under one lock."""
 
 import os
 import re
@@ -14,11 +14,11 @@ from mistyle.process import disk_errors
 
 
 class Keeper:
-    """Keeps the folders of finished stages of one run and lets one process at a time work there.
+    """Stores the folders of finished stages of one run and admits one process at a time.
 
     `root/<stage>/` holds a stage's files and `done.json` (its key and the sha256 of every file). The lock
     `root/.mistyle.lock` names process, host and time; it is released by `close`, at the end of a `with` block, and
-    when the object or the process goes. A lock whose process is gone is taken over.
+    when the object or the process ends. A dead process's lock is taken over.
     """
 
     def __init__(
@@ -29,14 +29,14 @@ class Keeper:
         shared: bool = False,
         overwrite: bool = False,
     ) -> None:
-        """Take the lock (UsageError when another run holds it) and clear away what killed runs left.
+        """Take the lock (UsageError when another run holds it) and remove leftovers of killed runs.
 
-        `say` gets a sentence about every folder that is set aside. In a `shared` folder others write single files
-        without the lock: only what dead processes of this computer left is cleared. `overwrite` lets a stage's files
-        replace those of the same names in a folder that is the user's.
+        `say` receives a sentence about every folder that is set aside. In a `shared` folder other processes write
+        single files without the lock: only leftovers of dead processes of this computer are removed. `overwrite` lets a
+        stage's files replace files of the same names in a user's folder.
         """
         self.root, self._say, self._overwrite = Path(os.path.abspath(root)), say, overwrite
-        with disk_errors.told(self.root):
+        with disk_errors.translated(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             self._owner = lock.take(self.root / LOCK)
         self._release = weakref.finalize(self, lock.release, self.root / LOCK, self._owner)
@@ -55,9 +55,9 @@ class Keeper:
     def get(self, stage: str, key: str, editable: Callable[[str], bool] = lambda name: False) -> Path | None:
         """The folder of a stage finished under this key with every file as it was written, else None.
 
-        A folder of another key stays where it is; a damaged one is renamed to `<stage>.broken-N`, never deleted.
+        A folder of another key stays; a damaged one is renamed to `<stage>.broken-N`, never deleted.
         Files that the stage did not write are ignored, and `editable` ones may have changed (jobs/edits.py). UsageError
-        for a folder that is the user's.
+        for a user's folder.
         """
         folder = self.root / _checked(stage)
         self._check_lock()
@@ -82,12 +82,11 @@ class Keeper:
     ) -> Path:
         """Run `write(folder)` on a new empty folder and keep it as the stage's result under `key`.
 
-        An older result of the stage is replaced only once the new one is complete; when `write` raises, or the disk
-        is full (MistyleError), the older one stays and nothing else does. What a user did there is not lost: an older
-        result with changed files is set aside like a broken one, and files that the stage had not written stay.
-        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them, the sentences
-        that `notes()` gives after `write`, and what else is said `about` the result. UsageError where a file that the
-        stage did not write has the name of one that it writes now.
+        The new result replaces an older one only once it is complete; when `write` raises, or the disk is full
+        (MistyleError), only the older one stays. A user's edits are kept: an older result with changed files is set
+        aside like a broken one, and files that the stage had not written stay. `edited` (name to sha256) are changed
+        files that `write` has read. The marker records them, the sentences of `notes()` after `write`, and `about`.
+        UsageError where a file that the stage did not write has the name of a new one.
         """
         target = self.root / _checked(stage)
         self._check_lock()
@@ -96,8 +95,8 @@ class Keeper:
         def fill(folder: Path) -> None:
             write(folder)
             self._check_lock()
-            told = {**(about or {}), "edited": dict(edited or {}), "notes": list(notes())}
-            atomic.seal(folder, stage=stage, key=key, **{name: value for name, value in told.items() if value})
+            details = {**(about or {}), "edited": dict(edited or {}), "notes": list(notes())}
+            atomic.seal(folder, stage=stage, key=key, **{name: value for name, value in details.items() if value})
             output.keep_folder(self.root, stage)
             if claimed and target.exists() and any(output.files_of(target)):
                 if atomic.intact(target, lambda name: name in (edited or {})) is None:
@@ -111,14 +110,14 @@ class Keeper:
         return target
 
     def _claimed(self, stage: str) -> bool:
-        """Whether the stage's folder is ours; UsageError for a user's, unless that was allowed (then False)."""
+        """Whether the stage's folder is ours; UsageError for a user's folder, or False with `overwrite`."""
         known = atomic.done(self.root / stage) is not None or output.keeps(self.root, stage)
         if not known and not self._overwrite:
             output.claim(self.root, folders=[stage])
         return known
 
     def notes(self, stage: str) -> list[str]:
-        """The sentences that a finished stage's marker remembers."""
+        """The sentences in a finished stage's marker."""
         return atomic.notes_of(self.root / _checked(stage))
 
     def _set_aside(self, folder: Path) -> None:

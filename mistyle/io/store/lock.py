@@ -1,7 +1,7 @@
-"""A lock file that names its holder: one process at a time in a folder, and a dead holder's lock is taken over.
+"""Lock file of a folder: admits one process at a time; a dead holder's lock is taken over.
 
-Where the system has flock, the holder keeps the file locked as long as it lives, however it ends: that decides for
-every process on the same kernel, in another container too. Elsewhere the holder's number and start time decide.
+Where the system has flock, the holder locks the file until it ends, however it ends. The flock decides for every
+process on the same kernel, in another container too. Elsewhere the holder's PID and start time decide.
 """
 
 import contextlib
@@ -27,27 +27,27 @@ _COUNTER = itertools.count()
 
 
 def take(lock: Path) -> str:
-    """Make the lock file and return its content (pid, host, when the process began, time), which `release` wants.
+    """Create the lock file and return its content (pid, host, start of the process, time), which `release` needs.
 
-    Raises UsageError when a living process holds it, or a process of another computer, which cannot be asked from
-    here; the message says how to go on.
+    Raises UsageError when a living process holds it, or a process of another computer, whose state is unknown here; the
+    message names the fix.
     """
     with _one_at_a_time(lock.parent):
         for _ in range(5):
             _remove_dead_lock(lock)
             try:
-                return _made(lock)
+                return _create(lock)
             except FileExistsError:
                 time.sleep(0.2)
     raise UsageError(f"{lock}: another run keeps taking this folder; wait for it, or choose another output folder")
 
 
-def _made(lock: Path) -> str:
-    """Put a complete lock file in place, which fails where there is one: FileExistsError."""
+def _create(lock: Path) -> str:
+    """Create a complete lock file atomically. FileExistsError where one exists."""
     pid = os.getpid()
     part = lock.with_name(f".{lock.name}.tmp-{this_host()}-{pid}-{next(_COUNTER)}")
     handle = os.open(part, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
-    kept = False
+    retained = False
     try:
         flocked = _flock(handle)
         values = {"pid": pid, "host": this_host(), "started": started_at(pid), "time": time.time(), "flock": flocked}
@@ -58,22 +58,22 @@ def _made(lock: Path) -> str:
         except FileExistsError:
             raise
         except OSError:
-            # No hard links here (FAT, some network shares): a lock of this kind is first empty for an instant.
+            # Without hard links (FAT, some network shares) the lock file is empty for an instant.
             owner = json.dumps(values | {"flock": False})
             with open(lock, "x", encoding="utf-8") as file:
                 file.write(owner)
             return owner
         if flocked:
-            _HANDLES[str(lock)], kept = handle, True
+            _HANDLES[str(lock)], retained = handle, True
         return owner
     finally:
-        if not kept:
+        if not retained:
             os.close(handle)
         part.unlink(missing_ok=True)
 
 
 def held(lock: Path, owner: str) -> bool:
-    """Whether the lock file is still the one that `take` made."""
+    """Whether the lock file is still the one that `take` created."""
     try:
         return lock.read_text(encoding="utf-8") == owner
     except OSError:
@@ -81,37 +81,37 @@ def held(lock: Path, owner: str) -> bool:
 
 
 def busy(lock: Path) -> bool:
-    """Whether a living process holds the lock, as far as can be known from here."""
+    """Whether a living process holds the lock, or may hold it on another computer."""
     try:
-        found = _owner(lock)
+        owner = _owner(lock)
     except (OSError, ValueError):
         return False
-    return _lives(lock, found) is not False
+    return _lives(lock, owner) is not False
 
 
 def _remove_dead_lock(lock: Path) -> None:
-    """Remove a lock whose process is gone; raises UsageError when it lives or cannot be asked."""
+    """Remove a dead process's lock; raises UsageError when the process lives or its state is unknown."""
     try:
         text, age = lock.read_text(encoding="utf-8"), time.time() - lock.stat().st_mtime
-        found = _owner(lock)
+        owner = _owner(lock)
     except FileNotFoundError:
         return
     except ValueError:
-        # A lock without a readable owner is one being written just now, or one cut off by a crash.
+        # A lock without a readable owner is being written just now, or a crash truncated it.
         if age < 5:
             time.sleep(0.2)
             return
-        found = None
-    lives = False if found is None else _lives(lock, found)
-    if lives is not False and found is not None:
-        when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(float(found["time"])))
+        owner = None
+    lives = False if owner is None else _lives(lock, owner)
+    if lives is not False and owner is not None:
+        when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(float(owner["time"])))
         if lives is None:
             raise UsageError(
-                f"{lock.parent}: a run on the computer '{found['host']}' (process {found['pid']}) has held this folder "
+                f"{lock.parent}: a run on the computer '{owner['host']}' (process {owner['pid']}) has held this folder "
                 f"since {when}; wait for it, or, if it no longer runs, remove {lock}"
             )
         raise UsageError(
-            f"{lock.parent}: process {found['pid']} has been working in this folder since {when}; "
+            f"{lock.parent}: process {owner['pid']} has been working in this folder since {when}; "
             "wait for it, stop it, or choose another output folder"
         )
     aside = lock.with_name(f".{lock.name}.tmp-{this_host()}-{os.getpid()}-{next(_COUNTER)}")
@@ -120,18 +120,18 @@ def _remove_dead_lock(lock: Path) -> None:
     except FileNotFoundError:
         return
     if aside.read_text(encoding="utf-8") != text:
-        # Another run took the dead lock over between our look and our rename: what we hold is its living one.
+        # Another run took the dead lock over between our read and our rename: we renamed its living lock.
         os.rename(aside, lock)
         return
     aside.unlink()
 
 
 def _owner(lock: Path) -> dict[str, Any]:
-    """What the lock says of its holder. Raises ValueError where it says nothing that can be read."""
-    found = read_own(lock)
+    """The lock's entries about its holder. Raises ValueError where they are unreadable."""
+    record = read_own(lock)
     try:
-        known = {k: kind(found[k]) for k, kind in (("pid", int), ("host", str), ("time", float))}
-        return {"started": found["started"], "flock": found.get("flock") is True} | known
+        known = {k: kind(record[k]) for k, kind in (("pid", int), ("host", str), ("time", float))}
+        return {"started": record["started"], "flock": record.get("flock") is True} | known
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"no owner: {error}") from error
 
@@ -152,7 +152,7 @@ def _lives(lock: Path, owner: Mapping[str, Any]) -> bool | None:
 
 
 def release(lock: Path, owner: str) -> None:
-    """Remove the lock file if it is still the one that `take` made in this process."""
+    """Remove the lock file if it is still the one that `take` created in this process."""
     # A forked child inherits the finalizer, not the lock.
     if json.loads(owner)["pid"] != os.getpid():
         return
@@ -161,7 +161,7 @@ def release(lock: Path, owner: str) -> None:
         if held(lock, owner):
             lock.unlink()
     if handle is not None:
-        # Unlocked by hand: a forked child may still hold the same open file.
+        # Unlocked explicitly: a forked child may still hold the same open file.
         with contextlib.suppress(OSError):
             if fcntl is not None:
                 fcntl.flock(handle, fcntl.LOCK_UN)
@@ -169,7 +169,7 @@ def release(lock: Path, owner: str) -> None:
 
 
 def _flock(handle: int) -> bool:
-    """Lock an open file without waiting; False where another holds it, or the file system knows no such locks."""
+    """Lock an open file without waiting; False where another process holds it, or the file system has no such locks."""
     if fcntl is None:
         return False
     try:
@@ -181,7 +181,7 @@ def _flock(handle: int) -> bool:
 
 @contextlib.contextmanager
 def _one_at_a_time(folder: Path) -> Iterator[None]:
-    """Keeps those who look at a dead lock of this folder at the same time apart, where the system can."""
+    """Serialise processes that examine a dead lock of this folder, where the system can."""
     if fcntl is None:
         yield
         return
@@ -195,7 +195,7 @@ def _one_at_a_time(folder: Path) -> Iterator[None]:
 
 
 def alive(pid: int) -> bool:
-    """Whether a process of this number runs on this computer; one that has ended and was not yet collected does not."""
+    """Whether a process with this PID runs on this computer; a zombie does not."""
     if os.name == "nt":
         import ctypes
 
@@ -216,13 +216,13 @@ def alive(pid: int) -> bool:
 
 
 def started_at(pid: int) -> str | None:
-    """When the process began (boot and ticks), where the system tells: a number used again is another process."""
+    """Start of the process (boot and ticks), None where unknown. It distinguishes processes with a reused PID."""
     boot, fields = _boot(), _fields(pid)
     return f"{boot} {fields[19]}" if boot and len(fields) > 19 else None
 
 
 def _boot() -> str | None:
-    """The name of this run of the kernel."""
+    """The kernel's boot ID."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -230,7 +230,7 @@ def _boot() -> str | None:
 
 
 def _fields(pid: int) -> list[str]:
-    """/proc's fields of a process from its state on; nothing where there is no /proc."""
+    """/proc's fields of a process from its state on; empty without /proc."""
     try:
         # The command's name stands in parentheses and may hold spaces; the start time is the 20th field after it.
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -1,9 +1,9 @@
-"""The user's folder, and the rule of every verb that writes: mistyle replaces only files that it wrote itself.
+"""Output folders: mistyle replaces only files that it wrote itself.
 
-`.mistyle.written` in an output folder lists those files with their sha256, and the subfolders that mistyle keeps whole
-(the stages of a run, each with a list of its own in done.json). Everything else in the folder is the user's: its bytes,
-names, times and links stay, empty folders too. A file that would be covered and is not in the list, or has changed
-since, is refused before the work; `overwrite` replaces files of colliding names, never an input, and deletes nothing.
+`.mistyle.written` in an output folder lists those files with their sha256, and the subfolders that mistyle owns:
+the stages of a run, each with its own list in done.json. All other content belongs to the user: bytes, names, times,
+links and empty folders stay. A verb refuses, before it works, to replace a file that is not in the list or has changed
+since. `overwrite` replaces files of colliding names, never an input, and deletes nothing.
 """
 
 import errno
@@ -35,7 +35,7 @@ from mistyle.io.store.trusted_json import read_own
 from mistyle.process import disk_errors
 
 RECORD = ".mistyle.written"
-# Files by which a folder of a version that kept no record is known.
+# Files that identify a folder of a version without a record.
 OLDER = (
     *("run.json", "camera.json", "compare.json", "verify.json", "converge.json", "lookdev.json", "batch.json"),
     *("done.json", "SHA256SUMS", "*.export.json", "*/done.json"),
@@ -52,7 +52,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Written:
-    """What mistyle wrote into a folder: files by their names inside it, and the subfolders that it keeps whole."""
+    """The files that mistyle wrote into a folder, by their names inside it, and the subfolders that it owns."""
 
     files: Mapping[str, Entry]
     folders: frozenset[str] = frozenset()
@@ -62,19 +62,19 @@ NOTHING = Written({})
 
 
 def read_written(root: Path) -> Written:
-    """The record of a folder; an empty one where there is none or where it is damaged."""
+    """The record of a folder; empty where it is absent or damaged."""
     try:
-        told = read_own(root / RECORD)
-        files = {str(k): Entry(str(v["by"]), tuple(map(str, v["sha256"]))) for k, v in told["files"].items()}
-        return Written(files, frozenset(map(str, told["folders"])))
+        record = read_own(root / RECORD)
+        files = {str(k): Entry(str(v["by"]), tuple(map(str, v["sha256"]))) for k, v in record["files"].items()}
+        return Written(files, frozenset(map(str, record["folders"])))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return NOTHING
 
 
 def _write_record(root: Path, written: Written) -> None:
     files = {name: {"by": entry.by, "sha256": list(entry.sha256)} for name, entry in sorted(written.files.items())}
-    told = {"about": "what mistyle wrote into this folder", "files": files, "folders": sorted(written.folders)}
-    atomic_write(root / RECORD, (json.dumps(told, indent=1) + "\n").encode())
+    record = {"about": "what mistyle wrote into this folder", "files": files, "folders": sorted(written.folders)}
+    atomic_write(root / RECORD, (json.dumps(record, indent=1) + "\n").encode())
 
 
 def claim(
@@ -86,11 +86,11 @@ def claim(
     aside: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Refuse an output folder in which something would be covered that mistyle did not write; writes nothing.
+    """Refuse an output folder in which a verb would replace a file that mistyle did not write; writes nothing.
 
-    `files` are the names inside `root` that a verb is going to write, `folders` the subfolders that it keeps whole.
-    With `aside` a file of ours may have been edited: the verb will set it aside (`write_file`). Raises UsageError,
-    which names the file, the reason and the way out.
+    `files` are the names inside `root` that a verb will write, `folders` the subfolders that it will own. With `aside`
+    a file of ours may have been edited: the verb will set it aside (`write_file`). Raises UsageError, which names the
+    file, the reason and the fix.
     """
     root = real(root)
     if os.path.lexists(root) and not root.is_dir():
@@ -108,7 +108,7 @@ def claim(
 
 
 def keeps(root: Path, name: str, written: Written | None = None) -> bool:
-    """Whether mistyle keeps this subfolder of an output folder, or may begin to: none of it is the user's."""
+    """Whether mistyle owns this subfolder of an output folder, or may claim it: it holds no user's file."""
     folder = root / name
     if not os.path.lexists(folder):
         return True
@@ -117,13 +117,13 @@ def keeps(root: Path, name: str, written: Written | None = None) -> bool:
 
 
 def _refuse_inputs(root: Path, files: list[str], folders: list[str], inputs: Iterable[Path]) -> None:
-    covered, kept = {real(root / name): name for name in files}, {real(root / name): name for name in folders}
+    covered, owned = {real(root / name): name for name in files}, {real(root / name): name for name in folders}
     for path in inputs:
         place = real(path)
-        inside = next((name for folder, name in kept.items() if place.is_relative_to(folder)), None)
+        inside = next((name for folder, name in owned.items() if place.is_relative_to(folder)), None)
         if place in covered or inside is not None:
-            what = f"is in {inside}/, which this command replaces" if inside else "would be replaced"
-            raise UsageError(f"{path}: this input {what}. Choose a folder with -o that holds no input")
+            reason = f"is in {inside}/, which this command replaces" if inside else "would be replaced"
+            raise UsageError(f"{path}: this input {reason}. Choose a folder with -o that holds no input")
 
 
 def _refuse_file(root: Path, name: str, written: Written, overwrite: bool) -> None:
@@ -159,7 +159,7 @@ def _refuse_folder(root: Path, name: str, overwrite: bool) -> None:
 
 
 def _why(root: Path) -> str:
-    """Why mistyle cannot know the files of a folder for its own, where the folder looks as if it had written some."""
+    """Why mistyle does not recognise its files in a folder that seems to hold some."""
     if (root / RECORD).is_file():
         return "" if read_written(root) is not NOTHING else f" ({RECORD}, the list of what it wrote here, is damaged)"
     if any(next(root.glob(pattern), None) for pattern in OLDER):
@@ -168,7 +168,7 @@ def _why(root: Path) -> str:
 
 
 def ours(root: Path, name: str, written: Written) -> bool:
-    """Whether the file is there as mistyle wrote it."""
+    """Whether the file exists as mistyle wrote it."""
     entry, path = written.files.get(name), root / name
     return entry is not None and path.is_file() and not path.is_symlink() and sha256_file(path) in entry.sha256
 
@@ -184,10 +184,10 @@ def replace_files(
 ) -> None:
     """Fill a new folder by `fill(folder)` and put its files into `root`, once all of them are complete.
 
-    `by` names the writer (a verb): its files of an earlier call that are not made again go, except edited and `lasting`
-    ones, which several writers share. A `root` that is new, or holds nothing but this writer's unchanged files, is
-    swapped as a whole; elsewhere each file is replaced atomically. Raises UsageError as `claim` does, for the names
-    that were filled.
+    `by` names the writer (a verb). Its files of an earlier call that are not written again are deleted, except edited
+    ones and `lasting` ones, which several writers share. A `root` that is new, or holds only this writer's unchanged
+    files, is swapped as a whole; elsewhere each file is replaced atomically. Raises UsageError as `claim` does, for the
+    names of the new files.
     """
     root = real(root)
     inputs = [real(path) for path in inputs]
@@ -199,18 +199,18 @@ def replace_files(
     def whole() -> bool:
         return _wholly(root, by) and not any(stays(name) for name in read_written(root).files)
 
-    with disk_errors.told(root):
+    with disk_errors.translated(root):
         root.parent.mkdir(parents=True, exist_ok=True)
     clean_leftovers(root.parent, name=root.name)
     if root.is_dir():
         clean_leftovers(root)
-    # Beside the folder, so that it can be swapped; inside where it is a disk of its own or nothing else may be written.
+    # Beside the folder, so that it can be swapped; inside where it is a mount point or its parent is read-only.
     alone = os.path.ismount(root) or (root.is_dir() and not os.access(root.parent, os.W_OK))
     place = root / "files" if alone else root
     count = next(COUNTER)
     temporary = hidden(place, count, "tmp")
     try:
-        with disk_errors.told(root, temporary):
+        with disk_errors.translated(root, temporary):
             temporary.mkdir()
             fill(temporary)
             new = {name: sha256_file(temporary / name) for name in files_of(temporary)}
@@ -227,18 +227,18 @@ def replace_files(
 
 
 def _merge(temporary: Path, root: Path, by: str, new: Mapping[str, str], stays: Callable[[str], bool]) -> None:
-    """Move the files in one by one. The record names old and new contents first: a kill leaves no file unknown."""
+    """Move the files one by one. The record first names old and new contents, so that a kill leaves no file unknown."""
     before = read_written(root)
     both = {name: Entry(by, (*_hashes(before, name), value)) for name, value in new.items()}
     _write_record(root, Written({**before.files, **both}, before.folders))
     for name in new:
         move(temporary / name, root / name)
-    gone = [name for name, entry in before.files.items() if entry.by == by and name not in new and not stays(name)]
-    for name in gone:
+    obsolete = [name for name, entry in before.files.items() if entry.by == by and name not in new and not stays(name)]
+    for name in obsolete:
         if ours(root, name, before):
             (root / name).unlink()
-    left = {name: entry for name, entry in before.files.items() if name not in gone}
-    _write_record(root, Written({**left, **{k: Entry(by, (v,)) for k, v in new.items()}}, before.folders))
+    remaining = {name: entry for name, entry in before.files.items() if name not in obsolete}
+    _write_record(root, Written({**remaining, **{k: Entry(by, (v,)) for k, v in new.items()}}, before.folders))
 
 
 def _hashes(written: Written, name: str) -> tuple[str, ...]:
@@ -246,7 +246,7 @@ def _hashes(written: Written, name: str) -> tuple[str, ...]:
 
 
 def move(source: Path, target: Path) -> None:
-    """Put a finished file in its place atomically, also where the place lies on another disk."""
+    """Move a finished file to its target atomically, also from another disk."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.replace(source, target)
@@ -257,10 +257,10 @@ def move(source: Path, target: Path) -> None:
 
 
 def write_file(root: Path, name: str, data: bytes, *, overwrite: bool = False) -> Path | None:
-    """Write one file of a folder that mistyle works in again and again (run.json); where it lies that was edited.
+    """Write one file of a folder that mistyle uses repeatedly (run.json).
 
-    An edited one is set aside as `<stem>.edited-N<suffix>`, whose path is returned. UsageError for one that is not
-    ours.
+    An edited older file is set aside as `<stem>.edited-N<suffix>`, whose path is returned. UsageError for a file that
+    is not ours.
     """
     root = real(root)
     written, path, aside = read_written(root), root / name, None
@@ -269,10 +269,10 @@ def write_file(root: Path, name: str, data: bytes, *, overwrite: bool = False) -
     if name in written.files and os.path.lexists(path) and not ours(root, name, written):
         places = (path.with_stem(f"{path.stem}.edited-{n}") for n in itertools.count(1))
         aside = next(place for place in places if not os.path.lexists(place))
-        with disk_errors.told(path):
+        with disk_errors.translated(path):
             os.rename(path, aside)
     _refuse_file(root, name, written, overwrite)
-    with disk_errors.told(root):
+    with disk_errors.translated(root):
         root.mkdir(parents=True, exist_ok=True)
     entry = Entry("run", (*_hashes(written, name), hashlib.sha256(data).hexdigest()))
     _write_record(root, Written({**written.files, name: entry}, written.folders))
@@ -290,7 +290,7 @@ def put_folder(
 ) -> None:
     """Fill a new folder by `fill(folder)` and put it at `target`: swapped in where only files of ours lie, else merged.
 
-    `written(target)` names those files. Of a merged folder they are replaced or go, and all others stay as they are.
+    `written(target)` names those files. In a merged folder they are replaced or deleted, and all others stay.
     UsageError where a file that is not ours has the name of a new one.
     """
 
@@ -319,29 +319,29 @@ def _lay_into(temporary: Path, target: Path, old: set[str], overwrite: bool) -> 
 
 
 def _only(folder: Path, names: set[str]) -> bool:
-    """Whether a folder holds nothing but these files, and may be swapped as a whole."""
+    """Whether a folder holds only these files, and may be swapped as a whole."""
     return not os.path.ismount(folder) and set(files_of(folder)) <= names and not _empty_folders(folder)
 
 
 def keep_folder(root: Path, name: str) -> None:
-    """Note that mistyle keeps this subfolder whole; it must have been claimed."""
+    """Record that mistyle owns this subfolder; it must have been claimed."""
     written = read_written(root)
     if name not in written.folders:
         _write_record(root, Written(written.files, written.folders | {name}))
 
 
 def forget_folder(root: Path, name: str) -> None:
-    """Take back `keep_folder` of a subfolder that is gone; a record that then holds nothing goes too."""
+    """Undo `keep_folder` for a removed subfolder; an empty record is deleted."""
     written = read_written(root)
-    left = Written(written.files, written.folders - {name})
-    if left == NOTHING:
+    remaining = Written(written.files, written.folders - {name})
+    if remaining == NOTHING:
         (root / RECORD).unlink(missing_ok=True)
-    elif left != written:
-        _write_record(root, left)
+    elif remaining != written:
+        _write_record(root, remaining)
 
 
 def move_aside(folder: Path, label: str, names: Iterable[str]) -> Path:
-    """Move these files of a folder to `<folder>.<label>-N`; all others stay where they are. Returns the new place."""
+    """Move these files of a folder to `<folder>.<label>-N`; all others stay. Returns the new path."""
     number = next(n for n in itertools.count(1) if not os.path.lexists(f"{folder}.{label}-{n}"))
     aside = folder.with_name(f"{folder.name}.{label}-{number}")
     chosen = set(names)
@@ -370,7 +370,7 @@ def _empty_folders(folder: Path) -> bool:
 
 
 def _wholly(root: Path, by: str) -> bool:
-    """Whether a folder holds nothing but what this writer left there, unchanged: then it may be swapped."""
+    """Whether a folder holds only this writer's unchanged files, and may be swapped."""
     written = read_written(root)
     if written is NOTHING or written.folders or any(entry.by != by for entry in written.files.values()):
         return False

@@ -1,6 +1,6 @@
-"""Frozen records as trees of plain JSON: what goes to disk (records.py) and to the reader process (wire.py).
+"""Frozen records as trees of plain JSON, for the disk (records.py) and the reader process (io/sandbox/rpc_codec.py).
 
-Arrays, and the names by which classes are found again, are the caller's.
+The caller handles arrays and the names of classes.
 """
 
 import dataclasses
@@ -13,11 +13,10 @@ import numpy as np
 Leaf = dict[str, Any]
 
 
-# Plain recursion and no inner functions: a function that refers to itself would keep the arrays until garbage is
-# collected.
+# Plain recursion without inner functions: a self-referencing closure would hold the arrays until garbage collection.
 def to_tree(value: Any, leaf: Callable[[Any], Leaf | None], name_of: Callable[[Any], str]) -> Any:
     """`value` as JSON. `leaf` gives the node of an array and the like, None for other values; `name_of` the name of a
-    record's class, or TypeError for what is not a record."""
+    record's class, or TypeError for other values."""
     if value is None or isinstance(value, bool | str | int | float):
         return value
     node = leaf(value)
@@ -39,8 +38,8 @@ def to_tree(value: Any, leaf: Callable[[Any], Leaf | None], name_of: Callable[[A
 
 
 def from_tree(tree: Any, leaf: Callable[[str, Any], Any], class_of: Callable[[str], type]) -> Any:
-    """The value that `to_tree` made `tree` of; `leaf` and `class_of` are the inverses. ValueError, KeyError, TypeError
-    or AttributeError where there is none."""
+    """The inverse of `to_tree`, with inverse `leaf` and `class_of`. ValueError, KeyError, TypeError or AttributeError
+    for an invalid tree."""
     if isinstance(tree, list):
         raise ValueError("a bare list")
     if not isinstance(tree, dict):

@@ -1,6 +1,6 @@
-"""Frozen records on disk: arrays as .npy beside one record.json, no pickle.
+"""Frozen records on disk: arrays as .npy beside one record.json, without pickle.
 
-Only dataclasses that live in mistyle itself are read back, so a forged folder cannot name other code.
+Only dataclasses of mistyle itself are read back, so a forged folder cannot name other code.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ def load_record(folder: Path) -> Any:
 
 
 def _pack(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """The tree of a value, whose arrays are added to `arrays` under names of their own."""
+    """The tree of a value; its arrays are added to `arrays` under new names."""
 
     def leaf(value: Any) -> dict[str, Any] | None:
         if not isinstance(value, np.ndarray):
@@ -72,7 +72,7 @@ def _class(name: str) -> type:
     module, _, qualname = name.partition(":")
     if not module.startswith("mistyle."):
         raise ValueError(f"{name} is not a record of mistyle")
-    found = getattr(importlib.import_module(module), qualname)
-    if not (isinstance(found, type) and dataclasses.is_dataclass(found)):
+    record_class = getattr(importlib.import_module(module), qualname)
+    if not (isinstance(record_class, type) and dataclasses.is_dataclass(record_class)):
         raise ValueError(f"{name} is not a record of mistyle")
-    return found
+    return record_class

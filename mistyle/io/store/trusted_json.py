@@ -1,7 +1,7 @@
 """JSON that mistyle wrote itself: markers of finished stages, lists of files, records, locks, plans.
 
-It is read in this process, but bounded, since a disk may have damaged it and a shared folder may be anyone's. What a
-stranger hands in goes through io/read.py and io/read_mesh.py instead.
+This process reads it with a size limit, since disk errors or other users of a shared folder may have changed it. User
+inputs go through io/read.py and io/read_mesh.py instead.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""What a USD file stands on, checked before USD composes it: every layer and package in the file's own folder."""
+"""Dependencies of a USD file, checked before composition: every layer and package in the file's own folder."""
 
 import posixpath
 import re
@@ -28,13 +28,13 @@ class PackagedFile:
 
 
 def place_of(layer: Any) -> PackagedFile:
-    """Where an opened layer lies."""
+    """The file, or the file in a package, of an opened layer."""
     outer, bracket, inner = str(layer.identifier).partition("[")
     return _inside(PackagedFile(Path(outer).resolve(), inner.removesuffix("]") if bracket else ""))
 
 
 def _inside(place: PackagedFile) -> PackagedFile:
-    """A package by itself is the first file in it."""
+    """A package's root layer: the first file in it."""
     if place.inner or place.file.suffix.lower() != ".usdz":
         return place
     with zipfile.ZipFile(place.file) as package:
@@ -42,63 +42,67 @@ def _inside(place: PackagedFile) -> PackagedFile:
 
 
 def locate(root: Path, anchor: PackagedFile, reference: str) -> PackagedFile:
-    """The file that a layer at `anchor` names. Raises InputRefused where it is outside `root` or no plain file name."""
-    found = f"a reference to {reference[:120]!r}"
+    """The file that a layer at `anchor` names. Raises InputRefused where it is outside `root` or not a plain file
+    name."""
+    problem = f"a reference to {reference[:120]!r}"
     name = reference.replace("\\", "/")
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name) or name.startswith(("//", "`")) or not name or "\0" in name:
-        raise refuse(anchor.file, found, "a relative file name (nothing is fetched)", COPY)
+        raise refuse(anchor.file, problem, "a relative file name (nothing is fetched)", COPY)
     outer, bracket, inner = name.partition("[")
     inner = inner.removesuffix("]")
     if anchor.inner:
         whole = posixpath.normpath(posixpath.join(posixpath.dirname(anchor.inner), outer))
         if whole.startswith(("/", "..")) or bracket:
-            raise refuse(anchor.file, found, "a file inside the package", "Package the asset again")
+            raise refuse(anchor.file, problem, "a file inside the package", "Package the asset again")
         return PackagedFile(anchor.file, whole)
     try:
         target = (anchor.file.parent / outer).resolve()
     except (OSError, RuntimeError) as error:  # a loop of links
-        raise refuse(anchor.file, found, "a file name", COPY) from error
+        raise refuse(anchor.file, problem, "a file name", COPY) from error
     if not target.is_relative_to(root):
-        raise refuse(anchor.file, found, "a file inside the mesh's own folder", COPY)
+        raise refuse(anchor.file, problem, "a file inside the mesh's own folder", COPY)
     return PackagedFile(target, inner if bracket else "")
 
 
 def check_layers(pxr: Any, path: Path) -> list[Path]:
     """Open the file and all layers that it is composed of, one by one, each only after its name and size passed.
 
-    Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, packages
-    that are compressed or nested, value clips (which would be opened later), too many or too large files.
+    Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, and
+    compressed or nested packages. Also refused: value clips (USD would open them later), and too many or too large
+    files.
     """
     root, start = path.resolve().parent, PackagedFile(path.resolve())
-    waiting, seen = [start], {str(start)}
+    pending, seen = [start], {str(start)}
     files: dict[Path, int] = {}
-    while waiting:
-        here = waiting.pop()
-        if here.file not in files:
-            files[here.file] = _size(here, path)
+    while pending:
+        layer = pending.pop()
+        if layer.file not in files:
+            files[layer.file] = _size(layer, path)
         if len(seen) > MAX_LAYERS or sum(files.values()) > MAX_FILE_BYTES:
-            found = f"{len(seen)} layers of {sum(files.values()) / 2**20:.0f} MiB"
-            raise refuse(path, found, f"at most {MAX_LAYERS} and {MAX_FILE_BYTES >> 20} MiB", "Flatten the stage")
-        for reference in _named(pxr, here, path):
-            there = locate(root, _inside(here), reference)
-            if Path(there.inner or there.file).suffix.lower() not in USD:
+            total = f"{len(seen)} layers of {sum(files.values()) / 2**20:.0f} MiB"
+            raise refuse(path, total, f"at most {MAX_LAYERS} and {MAX_FILE_BYTES >> 20} MiB", "Flatten the stage")
+        for reference in _named(pxr, layer, path):
+            dependency = locate(root, _inside(layer), reference)
+            if Path(dependency.inner or dependency.file).suffix.lower() not in USD:
                 raise refuse(path, f"a layer {reference[:120]!r}", f"layers of kind {' '.join(USD)}", COPY)
-            if there.inner and there.inner.lower().endswith(".usdz"):
+            if dependency.inner and dependency.inner.lower().endswith(".usdz"):
                 raise refuse(path, f"a package in a package ({reference[:120]!r})", "one package", "Package it again")
-            if str(there) not in seen:
-                seen.add(str(there))
-                waiting.append(there)
+            if str(dependency) not in seen:
+                seen.add(str(dependency))
+                pending.append(dependency)
     return list(files)
 
 
-def _named(pxr: Any, here: PackagedFile, path: Path) -> Iterator[str]:
-    """The layers that one layer names, in every variant."""
+def _named(pxr: Any, place: PackagedFile, path: Path) -> Iterator[str]:
+    """The layers that the layer at `place` names, in every variant."""
     try:
-        layer = pxr.Sdf.Layer.FindOrOpen(str(here))
+        layer = pxr.Sdf.Layer.FindOrOpen(str(place))
     except pxr.Tf.ErrorException as error:
-        raise refuse(path, f"a layer that USD cannot read ({said(error)})", "a USD file", "Export it again") from None
+        raise refuse(
+            path, f"a layer that USD cannot read ({usd_message(error)})", "a USD file", "Export it again"
+        ) from None
     if layer is None:
-        raise refuse(path, f"no USD layer at {str(here)[-120:]}", "a USD file", "Export it again")
+        raise refuse(path, f"no USD layer at {str(place)[-120:]}", "a USD file", "Export it again")
     clips: list[Any] = []
     layer.Traverse("/", lambda p: clips.append(p) if _has_clips(layer, p) else None)
     if clips:
@@ -111,19 +115,19 @@ def _has_clips(layer: Any, path: Any) -> bool:
     return prim is not None and (prim.HasInfo("clips") or prim.HasInfo("clipSets"))
 
 
-def _size(here: PackagedFile, path: Path) -> int:
-    if not here.file.is_file():
-        raise refuse(path, f"no file at {here.file}, which it stands on", "all its layers", "Copy the whole asset")
-    size = here.file.stat().st_size
+def _size(place: PackagedFile, path: Path) -> int:
+    if not place.file.is_file():
+        raise refuse(path, f"no file at {place.file}, which it depends on", "all its layers", "Copy the whole asset")
+    size = place.file.stat().st_size
     if size > MAX_FILE_BYTES:
         raise refuse(path, f"{size >> 20} MiB", f"at most {MAX_FILE_BYTES >> 20} MiB", "Reduce the file")
-    if here.file.suffix.lower() == ".usdz":
-        _check_package(here.file, size)
+    if place.file.suffix.lower() == ".usdz":
+        _check_package(place.file, size)
     return size
 
 
 def _check_package(path: Path, size: int) -> None:
-    """A USDZ package by its specification: a ZIP of files that are stored as they are, all inside it."""
+    """A USDZ package by its specification: a ZIP of uncompressed files, all inside it."""
     again = "Package it again (usdzip)"
     try:
         with zipfile.ZipFile(path) as package:
@@ -145,29 +149,29 @@ def _check_package(path: Path, size: int) -> None:
 
 
 def textures_named(pxr: Any, files: list[Path], root: Path) -> list[Path]:
-    """The other files in `root` that layers name, tiles spelled out: textures, mostly."""
-    found: set[Path] = set()
+    """The other files in `root` that layers name, with UDIM tiles expanded: mostly textures."""
+    result: set[Path] = set()
     for file in files:
         if file.suffix.lower() == ".usdz":
             continue
         for name in {n for kind in pxr.UsdUtils.ExtractExternalReferences(str(file)) for n in kind}:
             try:
-                there = locate(root, PackagedFile(file), name).file
+                target = locate(root, PackagedFile(file), name).file
             except InputRefused:
                 continue
-            tiles = there.parent.glob(there.name.replace("<UDIM>", "1???")) if "<UDIM>" in there.name else [there]
-            found |= {tile for tile in tiles if tile.is_file()}
-    return sorted(found - set(files))
+            tiles = target.parent.glob(target.name.replace("<UDIM>", "1???")) if "<UDIM>" in target.name else [target]
+            result |= {tile for tile in tiles if tile.is_file()}
+    return sorted(result - set(files))
 
 
-def said(error: Exception) -> str:
-    """USD's own words, without where in its sources they were said."""
-    words = re.findall(r": '(.*?)'?\s*$", str(error), flags=re.MULTILINE)
-    return (words[0] if words else str(error).strip().splitlines()[-1])[:160]
+def usd_message(error: Exception) -> str:
+    """USD's error message, without its source location."""
+    messages = re.findall(r": '(.*?)'?\s*$", str(error), flags=re.MULTILINE)
+    return (messages[0] if messages else str(error).strip().splitlines()[-1])[:160]
 
 
 def bytes_of(place: PackagedFile, limit: int) -> bytes | None:
-    """The content of a texture; None where it is not there."""
+    """The content of a texture; None where it is missing."""
     from mistyle.io.sandbox.bounds import read_bytes
 
     if not place.inner:

@@ -1,12 +1,12 @@
-"""A look layer: new materials for a USD file that stays as it is.
+"""A look layer: new materials for a USD file, which stays unchanged.
 
     #usda 1.0                    sublayers the source
     over "Chair" (               bindings (and, where a mesh was unwrapped, its new UVs) as overs on the source's prims
         variantSets = "look"     one variant per style: the materials that the bindings name
     )
 
-The bindings lie outside the variants on purpose: opinions of the source itself are local ones, which are stronger than
-any variant's. The variants therefore hold what only they say: the materials in the scope `look` of the root prim.
+The bindings lie outside the variants: the source's opinions are local ones, which are stronger than any variant's. So
+the variants hold only the materials, in the scope `look` of the root prim.
 """
 
 import os
@@ -30,7 +30,7 @@ SET = "look"
 
 @dataclass(frozen=True)
 class _SourceMesh:
-    """A mesh prim of the source: its path, its faces in the asset, its polygons, whether its place mirrors it."""
+    """A mesh prim of the source: its path, its faces in the asset, its polygons, whether its transform mirrors it."""
 
     name: str
     faces: slice
@@ -43,8 +43,8 @@ def write_look(
 ) -> None:
     """Write the layer `path` (.usda): `before` with one variant more, or a new one; the new variant is selected.
 
-    `asset` is the USD file as it was read, `looks` its materials by part, `beside` the folder that the layer will lie
-    in. Raises InputRefused where the file is no longer as it was read, UsageError where `before` lies over another one.
+    `asset` is the USD file as it was read, `looks` its materials by part, `beside` the folder of the layer. Raises
+    InputRefused where the file has changed since, UsageError where `before` lies over another file.
     """
     pxr = library()
     source = open_stage(pxr, asset.source.path)
@@ -52,8 +52,8 @@ def write_look(
     stage = _opened(pxr, path, source, os.path.relpath(asset.source.path, beside))
     shapes = _shapes(pxr, source, asset)
     root = "/" + shapes[0].name.strip("/").split("/")[0]
-    given = source.GetDefaultPrim()
-    root = str(given.GetPath()) if given else root
+    default_prim = source.GetDefaultPrim()
+    root = str(default_prim.GetPath()) if default_prim else root
     if not stage.GetRootLayer().HasDefaultPrim():
         stage.SetDefaultPrim(stage.GetPrimAtPath(root))
     prim = stage.OverridePrim(root)
@@ -62,7 +62,7 @@ def write_look(
     sets.SetVariantSelection(variant)
     used = sorted({int(k) for mesh in shapes for k in np.unique(asset.mesh.part[mesh.faces])})
     names = {part: f"{root}/{SET}/{looks[part].name}" for part in used}
-    primvars = {_kept(pxr, source, asset, mesh) for mesh in shapes}
+    primvars = {_authored_primvar(pxr, source, asset, mesh) for mesh in shapes}
     primvar = primvars.pop() if len(primvars) == 1 else None
     if primvar is None:
         primvar = f"st_{variant}"
@@ -80,7 +80,7 @@ def write_look(
 
 
 def _opened(pxr: Any, path: Path, source: Any, relative: str) -> Any:
-    """The layer over the source, with the stage metadata that only a root layer can say."""
+    """The layer over the source, with the stage metadata that only a root layer can hold."""
     layer = pxr.Sdf.Layer.FindOrOpen(str(path))
     over = Path(relative).as_posix()
     over = over if over.startswith("..") else f"./{over}"
@@ -102,33 +102,35 @@ def _opened(pxr: Any, path: Path, source: Any, relative: str) -> Any:
 def _shapes(pxr: Any, source: Any, asset: Asset) -> list[_SourceMesh]:
     """Every mesh prim of the asset in the source. InputRefused where the file has other meshes than the asset."""
     path = asset.source.path
-    there = {str(prim.GetPath()): (prim, matrix) for prim, _, matrix in mesh_prims(pxr, source, path, [])}
+    prims = {str(prim.GetPath()): (prim, matrix) for prim, _, matrix in mesh_prims(pxr, source, path, [])}
     result: dict[str, _SourceMesh] = {}
-    for one in asset.source.primitives:
-        prim, matrix = there.get(one.name, (None, None))
+    for entry in asset.source.primitives:
+        prim, matrix = prims.get(entry.name, (None, None))
         if prim is not None and is_shape(prim):
             kind = str(prim.GetTypeName())
             raise InputRefused(
-                f"{path}: {one.name} is a {kind}, which has no faces for a look to name; expected meshes. Turn it into "
-                "a mesh, or deliver another format"
+                f"{path}: {entry.name} is a {kind}, which has no faces for a look to name; expected meshes. Turn it "
+                "into a mesh, or deliver another format"
             )
         shape = None if prim is None else polygons(pxr, prim, path)
-        if shape is None or matrix is None or len(shape.corner) != one.stop - one.start:
-            raise InputRefused(f"{path}: {one.name} is no longer the mesh that the run read; run the job again")
+        if shape is None or matrix is None or len(shape.corner) != entry.stop - entry.start:
+            raise InputRefused(f"{path}: {entry.name} is no longer the mesh that the run read; run the job again")
         mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
-        result[one.name] = _SourceMesh(one.name, slice(one.start, one.stop), shape, mirrored)
+        result[entry.name] = _SourceMesh(entry.name, slice(entry.start, entry.stop), shape, mirrored)
     return list(result.values())
 
 
-def _kept(pxr: Any, source: Any, asset: Asset, mesh: _SourceMesh) -> str | None:
-    """The primvar at which the asset's UVs stand in the file already; None where it has others."""
-    found = uv_primvar(pxr, pxr.UsdGeom.Mesh(source.GetPrimAtPath(mesh.name)), [])
-    if asset.source.old_uvs is None or not found or "2" not in str(found.GetTypeName()):  # readers of two components
+def _authored_primvar(pxr: Any, source: Any, asset: Asset, mesh: _SourceMesh) -> str | None:
+    """The primvar of the file that holds the asset's UVs; None where it holds others."""
+    primvar = uv_primvar(pxr, pxr.UsdGeom.Mesh(source.GetPrimAtPath(mesh.name)), [])
+    if (
+        asset.source.old_uvs is None or not primvar or "2" not in str(primvar.GetTypeName())
+    ):  # readers of two components
         return None
     step = asset.mesh.corner_uvs[mesh.faces] - asset.source.old_uvs[mesh.faces]
-    # Moved by whole tiles: the texture repeats, the file's own UVs do.
+    # Equal up to whole tiles: the texture repeats, so the file's own UVs suffice.
     same = np.abs(step - np.round(step[:, :1])).max(initial=0) < 1e-4
-    return str(found.GetPrimvarName()) if same else None
+    return str(primvar.GetPrimvarName()) if same else None
 
 
 def _author(pxr: Any, stage: Any, asset: Asset, mesh: _SourceMesh, primvar: str) -> None:
@@ -148,7 +150,7 @@ def _author(pxr: Any, stage: Any, asset: Asset, mesh: _SourceMesh, primvar: str)
 
 
 def _editable(stage: Any, name: str) -> Any:
-    """The prim, its instances dissolved: what lies inside an instance cannot be overridden."""
+    """The prim without instancing: prims inside an instance cannot be overridden."""
     parts = name.strip("/").split("/")
     for count in range(1, len(parts) + 1):
         prim = stage.GetPrimAtPath("/" + "/".join(parts[:count]))
@@ -163,7 +165,7 @@ def _is_cut(stage: Any, name: str) -> bool:
 
 
 def _cut(pxr: Any, stage: Any, prim: Any, shape: Polygons) -> None:
-    """Override a mesh's topology by its triangles, and bring along what is said per face or corner."""
+    """Override a mesh's topology by its triangles, with its per-face and per-corner primvars."""
     if _is_cut(stage, str(prim.GetPath())):
         return
     corner = shape.corner[:, [0, 2, 1]] if shape.turned else shape.corner
@@ -176,9 +178,9 @@ def _cut(pxr: Any, stage: Any, prim: Any, shape: Polygons) -> None:
             primvar.BlockIndices() if primvar.IsIndexed() else None
             primvar.Set(type(values)([values[k] for k in rows]))
             primvar.SetInterpolation(pxr.UsdGeom.Tokens.faceVarying)
-    normals, how = mesh.GetNormalsAttr().Get(), mesh.GetNormalsInterpolation()
-    if normals and how in taken:
-        mesh.GetNormalsAttr().Set(type(normals)([normals[k] for k in taken[how].tolist()]))
+    normals, interpolation = mesh.GetNormalsAttr().Get(), mesh.GetNormalsInterpolation()
+    if normals and interpolation in taken:
+        mesh.GetNormalsAttr().Set(type(normals)([normals[k] for k in taken[interpolation].tolist()]))
         mesh.SetNormalsInterpolation(pxr.UsdGeom.Tokens.faceVarying)
     mesh.GetFaceVertexCountsAttr().Set(pxr.Vt.IntArray.FromNumpy(np.full(len(corner), 3, np.int32)))
     indices = shape.vertices[corner].reshape(-1).astype(np.int32)
@@ -222,9 +224,9 @@ def _bound(pxr: Any, stage: Any, prim: Any, place: str) -> None:
     for purpose in ("full", "preview"):
         if prim.GetRelationship(f"material:binding:{purpose}"):
             api.Bind(material, materialPurpose=purpose)
-    found = api.ComputeBoundMaterial()[0]
-    if not found or str(found.GetPath()) != place:
+    bound = api.ComputeBoundMaterial()[0]
+    if not bound or str(bound.GetPath()) != place:
         raise MistyleError(
-            f"{prim.GetPath()}: a stronger binding in the source keeps {found.GetPath() if found else 'no material'}; "
+            f"{prim.GetPath()}: a stronger binding in the source keeps {bound.GetPath() if bound else 'no material'}; "
             "remove its strongerThanDescendants or collection binding"
         )

@@ -1,4 +1,4 @@
-"""Materials of USD: UsdPreviewSurface, its constants, and its textures decoded when they are asked for."""
+"""Reader of USD materials: UsdPreviewSurface, its constants, and its textures, decoded on demand."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,13 +18,13 @@ from mistyle.io.usd.layers import PackagedFile, bytes_of, locate, place_of
 
 CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
 INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}
-# What is drawn and not painted.
+# Inputs that are drawn and not painted.
 SHADING = {"opacity": "opacity", "emission": "emissiveColor", "specular": "specularColor"}
 WRAPS: dict[str, Wrap] = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp"}
 PLAIN = Shading()
 COLOURS = ("albedo", "emission", "specular")
-OUTSIDE = 1e-3  # UVs that leave the unit square by less show nothing of what lies there
-# Inputs that change how a surface looks and are not read, unless they have this value.
+OUTSIDE = 1e-3  # UVs that leave the unit square by less do not show the outside
+# Inputs that change the appearance and are not read, unless they have this value.
 UNREAD = {"displacement": 0.0}
 UNPAINTED = {"emissiveColor": 0.0, "clearcoat": 0.0, "opacity": 1.0, "ior": 1.5}
 DEFAULTS = {"albedo": (0.18, 0.18, 0.18), "roughness": 0.5, "metallic": 0.0}
@@ -47,8 +47,8 @@ class UsdTexture:
 
 @dataclass(frozen=True)
 class UsdMaterial:
-    """A material, the primvar that its first texture is looked up at (None: it has none), the primvar that is its
-    albedo (None: it is said otherwise), and the textures by map."""
+    """A material, the UV primvar of its first texture (None: it has none), the primvar of its albedo (None: another
+    source), and the textures by map."""
 
     material: RawMaterial
     primvar: str | None
@@ -56,19 +56,23 @@ class UsdMaterial:
     textures: Mapping[str, UsdTexture] = field(default_factory=dict)
 
     def others(self) -> dict[str, str]:
-        """The primvar of every map that is looked up at another than the first."""
+        """The UV primvar of every map with another one than the first."""
         return {kind: t.primvar for kind, t in self.textures.items() if t.primvar != self.primvar}
 
 
-def at_own_coordinates(found: UsdMaterial, sets: Mapping[str, Float[np.ndarray, "f 3 2"]]) -> RawMaterial:
-    """The material whose maps are looked up at their own primvars; `sets` has the corners' coordinates by primvar."""
-    others = {kind: sets[name] for kind, name in found.others().items() if name in sets}
-    return replace(found.material, load=partial(_moved, found.material.load, others)) if others else found.material
+def at_own_coordinates(usd_material: UsdMaterial, sets: Mapping[str, Float[np.ndarray, "f 3 2"]]) -> RawMaterial:
+    """The material with its maps' own UV primvars; `sets` has the corners' coordinates by primvar."""
+    map_uvs = {kind: sets[name] for kind, name in usd_material.others().items() if name in sets}
+    return (
+        replace(usd_material.material, load=partial(_moved, usd_material.material.load, map_uvs))
+        if map_uvs
+        else usd_material.material
+    )
 
 
-def _moved(load: Any, others: dict[str, np.ndarray], tile: int) -> tuple[Maps, tuple[str, ...]]:
+def _moved(load: Any, map_uvs: dict[str, np.ndarray], tile: int) -> tuple[Maps, tuple[str, ...]]:
     maps, notes = load(tile)
-    return {k: replace(m, uvs=others[k]) if k in others else m for k, m in maps.items()}, notes
+    return {k: replace(m, uvs=map_uvs[k]) if k in map_uvs else m for k, m in maps.items()}, notes
 
 
 def plain(
@@ -77,25 +81,25 @@ def plain(
     colour: str | None = None,
     shading: Shading = PLAIN,
 ) -> UsdMaterial:
-    """A material without textures; `colour` is the primvar that is its albedo, `shading` what else it says."""
+    """A material without textures; `colour` is the primvar of its albedo, `shading` its other properties."""
     return UsdMaterial(RawMaterial(name, no_textures, None, albedo, 0.5, 0.0, shading), None, colour)
 
 
-def outside(found: UsdMaterial, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
-    """Notes on textures that are looked up outside the unit square and are black there, as the file says or for want of
-    a wrap mode."""
+def outside(usd_material: UsdMaterial, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
+    """Notes on textures that are used outside the unit square and are black there, by their wrap mode or without
+    one."""
     notes = []
     if uvs is None or not np.isfinite(uvs).any():
         return notes
-    for texture in found.textures.values():
-        if texture.primvar != found.primvar:
+    for texture in usd_material.textures.values():
+        if texture.primvar != usd_material.primvar:
             continue
         matrix = np.eye(3) if texture.transform is None else texture.transform
         lookup = uvs.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2]
         leaves = (np.nanmin(lookup, axis=(0, 1)) < -OUTSIDE) | (np.nanmax(lookup, axis=(0, 1)) > 1 + OUTSIDE)
         modes = {mode for mode, out in zip(texture.wrap, leaves, strict=True) if out}
         if "black" in modes:
-            notes.append(f"Texture {texture.file} is black outside the unit square; its last texels were taken there.")
+            notes.append(f"Texture {texture.file} is black outside the unit square; its border texels were used there.")
         if modes - set(WRAPS):
             notes.append(f"Texture {texture.file} has no wrap mode and was repeated outside the unit square.")
     return notes
@@ -111,25 +115,25 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
     textures: dict[str, UsdTexture] = {}
     constants: dict[str, Any] = dict(DEFAULTS)
     colour = None
-    for kind, named in INPUTS.items():
-        value = _source(pxr, surface.GetInput(named), time)
+    for kind, input_name in INPUTS.items():
+        value = _source(pxr, surface.GetInput(input_name), time)
         if isinstance(value, UsdTexture):
             textures[kind] = value
         elif isinstance(value, Primvar):
             if kind == "albedo" and value.kind.startswith("UsdPrimvarReader_") and value.name:
                 colour = value.name
             else:
-                notes.append(f"The {named} of material '{name}' comes from a {value.kind}, which was not read.")
+                notes.append(f"The {input_name} of material '{name}' comes from a {value.kind}, which was not read.")
         elif value is not None and kind != "normal":
             constants[kind] = value
     shading = _shading(pxr, surface, textures, time)
-    unread = [said for said in UNREAD if _differs(_source(pxr, surface.GetInput(said), time), UNREAD[said])]
+    unread = [n for n in UNREAD if _differs(_source(pxr, surface.GetInput(n), time), UNREAD[n])]
     if unread:
         notes.append(f"The {' and '.join(unread)} of material '{name}' was not read.")
     unpainted = [n for n in UNPAINTED if _differs(_source(pxr, surface.GetInput(n), time), UNPAINTED[n])]
     if unpainted:
         notes.append(
-            f"The {' and '.join(unpainted)} of material '{name}' is drawn; paintings and finished assets leave it out."
+            f"The {' and '.join(unpainted)} of material '{name}' is drawn; paintings and finished assets omit it."
         )
     if _source(pxr, surface.GetInput("useSpecularWorkflow"), time):
         notes.append(f"Material '{name}' has the specular workflow: it is drawn so, and painted as not metallic.")
@@ -138,7 +142,7 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
     white = "albedo" in textures or colour is not None
     albedo = (1.0, 1.0, 1.0) if white else tuple(float(np.clip(c, 0, 1)) for c in constants["albedo"])
     tiled = any("<UDIM>" in t.file for t in textures.values())
-    made = RawMaterial(
+    raw = RawMaterial(
         name,
         partial(_load, textures, root, budget) if textures else no_textures,
         tiled if textures else None,
@@ -147,15 +151,15 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
         1.0 if "metallic" in textures else float(np.clip(constants["metallic"], 0, 1)),
         shading,
     )
-    return UsdMaterial(made, next((t.primvar for t in textures.values()), None), colour, textures)
+    return UsdMaterial(raw, next((t.primvar for t in textures.values()), None), colour, textures)
 
 
 def _shading(pxr: Any, surface: Any, textures: dict[str, UsdTexture], time: Any) -> Shading:
-    """What the preview surface says besides the maps that are painted; its textures go into `textures`."""
+    """The preview surface's properties besides the painted maps; adds their textures to `textures`."""
 
-    def constant(name: str, otherwise: Any) -> Any:
+    def constant(name: str, default: Any) -> Any:
         value = _source(pxr, surface.GetInput(name), time)
-        return otherwise if value is None or isinstance(value, UsdTexture | Primvar) else value
+        return default if value is None or isinstance(value, UsdTexture | Primvar) else value
 
     glossy = bool(_source(pxr, surface.GetInput("useSpecularWorkflow"), time))
     for kind, name in SHADING.items():
@@ -180,7 +184,7 @@ def _shading(pxr: Any, surface: Any, textures: dict[str, UsdTexture], time: Any)
 
 
 def _differs(value: Any, neutral: float) -> bool:
-    """Whether an input says anything but its neutral value."""
+    """Whether an input differs from its neutral value."""
     if value is None:
         return False
     return isinstance(value, UsdTexture | Primvar) or bool((np.array(value, float) != neutral).any())
@@ -188,17 +192,17 @@ def _differs(value: Any, neutral: float) -> bool:
 
 @dataclass(frozen=True)
 class Primvar:
-    """An input that comes from a shader of another `kind` than a texture; `name`: the primvar that it reads."""
+    """An input from a shader of another `kind` than a texture; `name`: the primvar that it reads."""
 
     kind: str
     name: str
 
 
-def _source(pxr: Any, given: Any, time: Any) -> Any:
-    """A constant, a UsdTexture, another shader as a Primvar, or None where nothing is said."""
-    if not given:
+def _source(pxr: Any, shader_input: Any, time: Any) -> Any:
+    """A constant, a UsdTexture, another shader as a Primvar, or None without a value."""
+    if not shader_input:
         return None
-    producing = given.GetValueProducingAttributes()
+    producing = shader_input.GetValueProducingAttributes()
     if not producing:
         return None
     attribute = producing[0]
@@ -228,9 +232,9 @@ def _texture(pxr: Any, shader: Any, channel: str, time: Any) -> UsdTexture | Non
 
 
 def _attribute(shader: Any, name: str) -> Any:
-    """Where an input's value comes from: itself, or what it is connected to."""
-    given = shader.GetInput(name)
-    producing = given.GetValueProducingAttributes() if given else []
+    """The attribute that provides an input's value: its own, or a connected one."""
+    shader_input = shader.GetInput(name)
+    producing = shader_input.GetValueProducingAttributes() if shader_input else []
     return producing[0] if producing else None
 
 
@@ -239,11 +243,11 @@ def _value(shader: Any, name: str, time: Any) -> Any:
     return attribute.Get(time) if attribute else None
 
 
-def _lookup(pxr: Any, given: Any, time: Any) -> tuple[str, Float[np.ndarray, "3 3"] | None]:
-    """The primvar's name and the UsdTransform2d on the way (translation * rotation * scale), v up."""
+def _lookup(pxr: Any, shader_input: Any, time: Any) -> tuple[str, Float[np.ndarray, "3 3"] | None]:
+    """The primvar's name and the product of UsdTransform2d nodes (translation * rotation * scale), v up."""
     transform = None
     for _ in range(8):
-        producing = given.GetValueProducingAttributes() if given else []
+        producing = shader_input.GetValueProducingAttributes() if shader_input else []
         shader = pxr.UsdShade.Shader(producing[0].GetPrim()) if producing else None
         kind = shader.GetShaderId() if shader else None
         if kind == "UsdTransform2d":
@@ -251,9 +255,9 @@ def _lookup(pxr: Any, given: Any, time: Any) -> tuple[str, Float[np.ndarray, "3 
             scale = _value(shader, "scale", time) or (1, 1)
             move = _value(shader, "translation", time) or (0, 0)
             c, s = np.cos(turn), np.sin(turn)
-            here = np.array([[c, -s, move[0]], [s, c, move[1]], [0, 0, 1]]) @ np.diag([scale[0], scale[1], 1.0])
-            transform = here if transform is None else transform @ here
-            given = shader.GetInput("in") if shader else None
+            matrix = np.array([[c, -s, move[0]], [s, c, move[1]], [0, 0, 1]]) @ np.diag([scale[0], scale[1], 1.0])
+            transform = matrix if transform is None else transform @ matrix
+            shader_input = shader.GetInput("in") if shader else None
             continue
         name = _value(shader, "varname", time) if kind == "UsdPrimvarReader_float2" else None
         return str(name or "st"), transform
@@ -277,7 +281,7 @@ def _load(textures: dict[str, UsdTexture], root: Path, budget: Budget, tile: int
 
 
 def _texels(kind: str, texture: UsdTexture, place: PackagedFile, budget: Budget, notes: list[str]) -> np.ndarray | None:
-    """One map as `Material` has it; None with a note where it is not there or cannot be used."""
+    """One map as `Material` has it; None with a note where it is missing or unusable."""
     chosen = CHANNELS[texture.channel]
     if not chosen:
         return _alpha(texture, place, notes)
@@ -291,21 +295,21 @@ def _texels(kind: str, texture: UsdTexture, place: PackagedFile, budget: Budget,
         pixels = None if data is None else decode(data, str(place), budget, "colour" if decoded else "data")
     if pixels is None:
         return None
-    return _meant(kind, texture, pixels, chosen)
+    return _converted(kind, texture, pixels, chosen)
 
 
 def _alpha(texture: UsdTexture, place: PackagedFile, notes: list[str]) -> Float[np.ndarray, "h w"] | None:
-    """A map that is a texture's alpha; 1 where it has none."""
+    """A texture's alpha as a map; 1 where it has none."""
     data = bytes_of(place, MAX_PICTURE_BYTES)
     if data is None:
         notes.append(f"Texture {texture.file} is not there and was left out.")
         return None
-    scale, bias = ((said or (other,) * 4)[3] for said, other in ((texture.scale, 1.0), (texture.bias, 0.0)))
+    scale, bias = ((value or (default,) * 4)[3] for value, default in ((texture.scale, 1.0), (texture.bias, 0.0)))
     return np.clip(alpha_map(data, str(place)) * np.float32(scale) + np.float32(bias), 0, 1)
 
 
 def _light(place: PackagedFile, notes: list[str]) -> np.ndarray | None:
-    """An EXR texture's first three channels; a single one counts for all."""
+    """An EXR texture's first three channels; a single one is repeated."""
     from mistyle.io.images.hdr import read_exr
 
     if place.inner or not place.file.is_file():
@@ -317,12 +321,12 @@ def _light(place: PackagedFile, notes: list[str]) -> np.ndarray | None:
     return np.stack([planes[names[min(k, len(names) - 1)]] for k in range(3)], axis=-1)
 
 
-def _meant(kind: str, texture: UsdTexture, pixels: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
-    """scale * texel + bias in the channels that are used; normals as unit vectors, 2 c - 1 where nothing is said."""
-    said = texture.scale is not None or texture.bias is not None
+def _converted(kind: str, texture: UsdTexture, pixels: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
+    """scale * texel + bias in the used channels; normals as unit vectors, 2 c - 1 by default."""
+    has_range = texture.scale is not None or texture.bias is not None
     scale = np.array((texture.scale or (1, 1, 1, 1))[:3], np.float32)
     bias = np.array((texture.bias or (0, 0, 0, 0))[:3], np.float32)
-    if kind == "normal" and not said:
+    if kind == "normal" and not has_range:
         scale, bias = np.full(3, 2, np.float32), np.full(3, -1, np.float32)
     values = pixels * scale + bias
     if kind == "normal":

@@ -1,4 +1,4 @@
-"""A mesh prim of USD as triangles, and its values at their corners: normals, texture coordinates and colours."""
+"""Reader of a USD mesh prim: triangles, and normals, texture coordinates and colours at their corners."""
 
 import re
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from mistyle.io.sandbox.bounds import refuse
 from mistyle.io.usd.materials import UsdMaterial
 from mistyle.io.usd.shapes import is_shape, outline
 
-CAGE_CREASE = 89.0  # degrees; sharper edges of a cage would have normals that face away from who sees them
+CAGE_CREASE = 89.0  # degrees; beyond it, smooth normals at a cage's edges could face away from the viewer
 UV_NAMES = ("st", "UVMap", "map1", "uv")
 
 
@@ -38,7 +38,7 @@ class Polygons:
 
 
 def polygons(pxr: Any, prim: Any, path: Path, max_faces: int = 2**31) -> Polygons | None:
-    """The faces of a mesh prim as triangles, in file order; None where it has none. Holes are left out."""
+    """The faces of a mesh prim as triangles, in file order; None where it has none. Holes are dropped."""
     mesh, time = pxr.UsdGeom.Mesh(prim), pxr.Usd.TimeCode.EarliestTime()
     if is_shape(prim):
         shape = outline(prim, time)
@@ -52,8 +52,8 @@ def polygons(pxr: Any, prim: Any, path: Path, max_faces: int = 2**31) -> Polygon
         return None
     again = "Export the mesh again"
     if (sizes < 0).any() or sizes.sum() != len(vertices):
-        found = f"{prim.GetPath()} with {len(vertices)} corners for faces of {int(sizes.sum())}"
-        raise refuse(path, found, "as many indices as its faces have corners", again)
+        problem = f"{prim.GetPath()} with {len(vertices)} corners for faces of {int(sizes.sum())}"
+        raise refuse(path, problem, "as many indices as its faces have corners", again)
     too_many(len(sizes), max_faces, path)
     too_many(len(points), 3 * max_faces, path, "vertices")
     check_indices(vertices, len(points), path, "vertex")
@@ -61,24 +61,24 @@ def polygons(pxr: Any, prim: Any, path: Path, max_faces: int = 2**31) -> Polygon
     corner = triangulate(sizes, points[vertices])
     polygon = np.repeat(np.arange(len(sizes)), sizes)[corner[:, 0]] if len(corner) else np.zeros(0, np.int64)
     holes = np.array(mesh.GetHoleIndicesAttr().Get(time) or [], np.int64)
-    kept = ~np.isin(polygon, holes)
+    solid = ~np.isin(polygon, holes)
     turned = mesh.GetOrientationAttr().Get(time) == pxr.UsdGeom.Tokens.leftHanded
-    corner = corner[kept][:, [0, 2, 1]] if turned else corner[kept]
-    return Polygons(points, sizes, vertices, corner, polygon[kept], turned)
+    corner = corner[solid][:, [0, 2, 1]] if turned else corner[solid]
+    return Polygons(points, sizes, vertices, corner, polygon[solid], turned)
 
 
 def triples(values: Any) -> Float[np.ndarray, "n 3"] | None:
-    """A list of three numbers each, no rows where nothing is authored; None for a value of another type."""
+    """Rows of three numbers, no rows without an authored value; None for a value of another type."""
     if values is None:
         return np.zeros((0, 3))
-    found = np.array(values, np.float64)
-    if found.size == 0:
+    table = np.array(values, np.float64)
+    if table.size == 0:
         return np.zeros((0, 3))
-    return found if found.ndim == 2 and found.shape[1] == 3 else None
+    return table if table.ndim == 2 and table.shape[1] == 3 else None
 
 
 def is_cage(pxr: Any, prim: Any, time: Any) -> bool:
-    """Whether a prim is the cage of a smooth surface."""
+    """Whether a prim is the control cage of a subdivision surface."""
     if is_shape(prim):
         return False
     flat = (pxr.UsdGeom.Tokens.none, pxr.UsdGeom.Tokens.bilinear)
@@ -86,13 +86,13 @@ def is_cage(pxr: Any, prim: Any, time: Any) -> bool:
 
 
 def corner_normals(pxr: Any, prim: Any, shape: Polygons, time: Any, notes: list[str]) -> np.ndarray | None:
-    """A prim's own normals; those of the cage, smooth, where it is subdivided and has none."""
+    """A prim's own normals; smooth normals of the cage where it is subdivided and has none."""
     if shape.normals is not None:
         return shape.normals[shape.corner].astype(np.float32)
-    found = _own_normals(pxr, pxr.UsdGeom.Mesh(prim), shape, time, notes)
-    if found is None and is_cage(pxr, prim, time):
-        found = crease_normals(shape.points, shape.vertices[shape.corner], same_points(shape.points), CAGE_CREASE)
-    return found
+    normals = _own_normals(pxr, pxr.UsdGeom.Mesh(prim), shape, time, notes)
+    if normals is None and is_cage(pxr, prim, time):
+        normals = crease_normals(shape.points, shape.vertices[shape.corner], same_points(shape.points), CAGE_CREASE)
+    return normals
 
 
 def _own_normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[str]) -> np.ndarray | None:
@@ -106,13 +106,13 @@ def _own_normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[st
     return _spread(values, mesh.GetNormalsInterpolation(), shape, 3, "normals", notes)
 
 
-def uv_primvar(pxr: Any, mesh: Any, wanted: list[str]) -> Any:
-    """The primvar to look textures up at: the materials' own, a usual name, else the first that holds coordinates."""
+def uv_primvar(pxr: Any, mesh: Any, preferred: list[str]) -> Any:
+    """The UV primvar of textures: the materials' own, a usual name, else the first with coordinates."""
     primvars = pxr.UsdGeom.PrimvarsAPI(mesh)
-    for name in (*wanted, *UV_NAMES):
-        found = primvars.FindPrimvarWithInheritance(name)
-        if found and found.HasValue() and _is_pair(found):
-            return found
+    for name in (*preferred, *UV_NAMES):
+        primvar = primvars.FindPrimvarWithInheritance(name)
+        if primvar and primvar.HasValue() and _is_pair(primvar):
+            return primvar
     return next(
         (p for p in primvars.GetPrimvarsWithValues() if _is_pair(p) and "texCoord" in str(p.GetTypeName())), None
     )
@@ -125,9 +125,9 @@ def _is_pair(primvar: Any) -> bool:
 
 @dataclass(frozen=True)
 class CornerValues:
-    """Reads the values of a mesh prim at the corners of its triangles, which are `shape` at `time`.
+    """Reads the values of a mesh prim at the corners of its triangles, `shape` at `time`.
 
-    `material` is the number of every triangle's material in `materials`. What was left out is added to `notes`.
+    `material` is the index of every triangle's material in `materials`. `notes` collects sentences on dropped values.
     """
 
     pxr: Any
@@ -142,12 +142,12 @@ class CornerValues:
         """Every triangle's corners at the primvar of its own material."""
         result = None
         for name in dict.fromkeys(self.materials[k].primvar for k in np.unique(self.material)):
-            found = uv_primvar(self.pxr, self.mesh, [name] if name else [])
-            if found and name and found.GetPrimvarName() != name:
+            primvar = uv_primvar(self.pxr, self.mesh, [name] if name else [])
+            if primvar and name and primvar.GetPrimvarName() != name:
                 self.notes.append(
-                    f"There are no texture coordinates '{name}' on a mesh; '{found.GetPrimvarName()}' were taken."
+                    f"A mesh has no texture coordinates '{name}'; '{primvar.GetPrimvarName()}' were used."
                 )
-            values = self._spread(found, 2, "UVs") if found else None
+            values = self._spread(primvar, 2, "UVs") if primvar else None
             if values is not None:
                 result = np.full(values.shape, np.nan, np.float32) if result is None else result
                 rows = np.isin(self.material, [k for k, m in enumerate(self.materials) if m.primvar == name])
@@ -155,17 +155,17 @@ class CornerValues:
         return result
 
     def other_uvs(self) -> dict[str, Float[np.ndarray, "f 3 2"]]:
-        """The coordinates that maps of the triangles' materials have beside those of the first map, by primvar."""
-        found = {}
+        """Additional coordinates that maps of the triangles' materials use, by primvar."""
+        values_of = {}
         for name in dict.fromkeys(n for k in np.unique(self.material) for n in self.materials[k].others().values()):
             primvar = self.pxr.UsdGeom.PrimvarsAPI(self.mesh).FindPrimvarWithInheritance(name)
             if primvar and primvar.HasValue() and _is_pair(primvar):
-                found[name] = self._spread(primvar, 2, "UVs")
-        return {name: values for name, values in found.items() if values is not None}
+                values_of[name] = self._spread(primvar, 2, "UVs")
+        return {name: values for name, values in values_of.items() if values is not None}
 
     def colours(self) -> Float[np.ndarray, "f 3 3"] | None:
-        """Linear corner colours of the triangles whose material has a primvar as its albedo, white on the others; None
-        where none has."""
+        """Linear corner colours, from the primvar that is a material's albedo, white elsewhere; None without such a
+        material."""
         result = None
         for name in dict.fromkeys(self.materials[k].colour for k in np.unique(self.material)):
             primvar = self.pxr.UsdGeom.PrimvarsAPI(self.mesh).FindPrimvarWithInheritance(name) if name else None
@@ -178,9 +178,9 @@ class CornerValues:
                 result[rows] = np.clip(np.nan_to_num(values[rows], nan=1.0), 0, 1)
         return result
 
-    def _spread(self, primvar: Any, width: int, what: str) -> Float[np.ndarray, "f 3 w"] | None:
+    def _spread(self, primvar: Any, width: int, label: str) -> Float[np.ndarray, "f 3 w"] | None:
         table = table_of(primvar, self.time)
-        return _spread(table, primvar.GetInterpolation(), self.shape, width, what, self.notes)
+        return _spread(table, primvar.GetInterpolation(), self.shape, width, label, self.notes)
 
 
 def table_of(primvar: Any, time: Any) -> Float[np.ndarray, "n w"] | None:
@@ -192,12 +192,12 @@ def table_of(primvar: Any, time: Any) -> Float[np.ndarray, "n w"] | None:
 
 
 def _spread(
-    values: Any, interpolation: str, shape: Polygons, width: int, what: str, notes: list[str]
+    values: Any, interpolation: str, shape: Polygons, width: int, label: str, notes: list[str]
 ) -> Float[np.ndarray, "f 3 w"] | None:
-    """A primvar's values at every triangle corner; None, with a note, where there are not as many as there must be."""
+    """A primvar's values at every triangle corner; None, with a note, where their number is wrong."""
     if values is None or len(values) == 0:
         return None
-    table = np.array(values, np.float32).reshape(len(values), -1)[:, : width if what == "UVs" else None]
+    table = np.array(values, np.float32).reshape(len(values), -1)[:, : width if label == "UVs" else None]
     where = {
         "faceVarying": (len(shape.vertices), shape.corner),
         "vertex": (len(shape.points), shape.vertices[shape.corner]),
@@ -207,6 +207,6 @@ def _spread(
     }
     count, index = where.get(str(interpolation), (-1, shape.corner))
     if count != len(table) or table.shape[1] != width:
-        notes.append(f"{what} of another number than {interpolation} values need were left out.")
+        notes.append(f"{label} were left out: their number does not match their interpolation ({interpolation}).")
         return None
     return table[index]

@@ -1,6 +1,6 @@
-"""USD to triangles: every visible mesh of the stage, in metres and Y up, with its preview surfaces. Needs `usd-core`.
+"""Reader of USD stages: triangles of every visible mesh, in metres and Y up, with preview surfaces. Needs `usd-core`.
 
-Values are those of the default time, of animated ones the earliest. A subdivision surface comes as its control cage.
+Values are those of the default time, of animated ones the earliest. A subdivision surface is read as its control cage.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from mistyle.io.usd.write import library
 
 @dataclass(frozen=True)
 class _MeshPiece:
-    """One mesh prim where it stands; `owner` is what instances of it share."""
+    """One mesh prim in world space; `owner` is the path that its instances share."""
 
     name: str
     owner: str
@@ -39,7 +39,7 @@ class _MeshPiece:
 
 
 class _Reading:
-    """The stage that is being read; a class because materials and notes gather as prims are met."""
+    """State of reading one stage: materials and notes collected over the prims."""
 
     def __init__(self, pxr: Any, path: Path, max_faces: int) -> None:
         self.pxr, self.path, self.max_faces = pxr, path, max_faces
@@ -50,19 +50,19 @@ class _Reading:
         self._budget = Budget(path)
 
     def number(self, material: Any, shown: UsdMaterial) -> int:
-        """The place in `materials` of a bound material; of `shown` where none is bound."""
-        here = shown.material
-        key = str(material.GetPath()) if material else f"{here.albedo_factor} {shown.colour} {here.shading}"
+        """The index in `materials` of a bound material; that of `shown` where none is bound."""
+        display = shown.material
+        key = str(material.GetPath()) if material else f"{display.albedo_factor} {shown.colour} {display.shading}"
         if key not in self._numbers:
             self._numbers[key] = len(self.materials)
             root = self.path.resolve().parent
-            read = read_material(self.pxr, material, root, self._budget, self.time, self.notes) if material else shown
-            self.materials.append(read)
+            entry = read_material(self.pxr, material, root, self._budget, self.time, self.notes) if material else shown
+            self.materials.append(entry)
         return self._numbers[key]
 
 
 def files_of(path: Path) -> list[Path]:
-    """The layers, packages and textures that a file stands on, itself among them."""
+    """The layers, packages and textures that a file depends on, including itself."""
     pxr = library()
     files = check_layers(pxr, path)
     return [*files, *textures_named(pxr, files, path.resolve().parent)]
@@ -99,14 +99,16 @@ def _raw(pieces: list[_MeshPiece], materials: list[UsdMaterial], notes: list[str
         parts = [getattr(p, name) for p in pieces]
         if all(part is None for part in parts):
             return None
-        nothing = [np.full((len(p.faces), 3, width), missing, np.float32) for p in pieces]
-        return np.concatenate([no if part is None else part for part, no in zip(parts, nothing, strict=True)])
+        blanks = [np.full((len(p.faces), 3, width), missing, np.float32) for p in pieces]
+        return np.concatenate([blank if part is None else part for part, blank in zip(parts, blanks, strict=True)])
 
     material, uvs = np.concatenate([p.material for p in pieces]), joined("uvs", 2)
     used = np.unique(material)
     missing = [np.full((len(p.faces), 3, 2), np.nan, np.float32) for p in pieces]
     names = dict.fromkeys(name for k in used for name in materials[k].others().values())
-    others = {n: np.concatenate([p.others.get(n, no) for p, no in zip(pieces, missing, strict=True)]) for n in names}
+    others = {
+        n: np.concatenate([p.others.get(n, blank) for p, blank in zip(pieces, missing, strict=True)]) for n in names
+    }
     notes += [note for k in used for note in outside(materials[k], None if uvs is None else uvs[material == k])]
     return Raw(
         kind="usd",
@@ -127,7 +129,7 @@ def _raw(pieces: list[_MeshPiece], materials: list[UsdMaterial], notes: list[str
 
 
 def _piece(reading: _Reading, prim: Any, owner: str, matrix: Float[np.ndarray, "4 4"]) -> _MeshPiece | None:
-    """A mesh prim where `matrix` (row vectors) puts it; None, perhaps with a note, where it has no triangles."""
+    """A mesh prim transformed by `matrix` (row vectors); None, perhaps with a note, where it has no triangles."""
     pxr, time, notes = reading.pxr, reading.time, reading.notes
     mesh = pxr.UsdGeom.Mesh(prim)
     shape = polygons(pxr, prim, reading.path, reading.max_faces)
@@ -144,8 +146,8 @@ def _piece(reading: _Reading, prim: Any, owner: str, matrix: Float[np.ndarray, "
     elif not is_shape(prim) and mesh.GetPointsAttr().ValueMightBeTimeVarying():
         notes.append("Only the first frame of an animated mesh was read.")
     if not np.isfinite(matrix).all():
-        found = f"{prim.GetPath()} with a transform that is not finite"
-        raise refuse(reading.path, found, "finite numbers", "Export it again")
+        problem = f"{prim.GetPath()} with a transform that is not finite"
+        raise refuse(reading.path, problem, "finite numbers", "Export it again")
     linear = matrix[:3, :3]
     if np.linalg.det(linear) < 0:
         shape = replace(shape, corner=shape.corner[:, [0, 2, 1]], turned=True)
@@ -198,20 +200,20 @@ def _bound(reading: _Reading, prim: Any, shape: Polygons) -> Int[np.ndarray, " f
 
 
 def _material_of(pxr: Any, prim: Any, notes: list[str]) -> Any:
-    """The material bound for previews or for all purposes; where there is none, that for full renders."""
+    """The material bound for previews or for all purposes, else that for full renders."""
     tokens = pxr.UsdShade.Tokens
     binding = pxr.UsdShade.MaterialBindingAPI(prim)
-    found = binding.ComputeBoundMaterial(tokens.preview)[0]
-    if found:
-        return found
-    found = binding.ComputeBoundMaterial(tokens.full)[0]
-    if found:
-        notes.append("Materials that are bound for full renders alone were taken.")
-    return found
+    material = binding.ComputeBoundMaterial(tokens.preview)[0]
+    if material:
+        return material
+    material = binding.ComputeBoundMaterial(tokens.full)[0]
+    if material:
+        notes.append("Materials bound only for full renders were used.")
+    return material
 
 
 def _display(pxr: Any, prim: Any, time: Any) -> UsdMaterial:
-    """What a mesh without a material shows: its display colour, by vertex where it has more than one."""
+    """The material of a mesh without one: its display colour, by vertex where it has several."""
     primvars = pxr.UsdGeom.PrimvarsAPI(prim)
     primvar = primvars.FindPrimvarWithInheritance("displayColor")
     values = table_of(primvar, time) if primvar and primvar.HasValue() else None

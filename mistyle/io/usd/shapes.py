@@ -1,4 +1,4 @@
-"""USD's shapes that are no meshes (spheres, cubes, cylinders, cones, capsules, planes) as polygons with normals."""
+"""USD's analytic shapes (spheres, cubes, cylinders, cones, capsules, planes) as polygons with normals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,28 +30,28 @@ def is_shape(prim: Any) -> bool:
 def outline(prim: Any, time: Any) -> Outline:
     """The surface of a shape at a time, with its own attributes (radius, height, size, axis)."""
 
-    def said(name: str, otherwise: Any) -> Any:
+    def attribute_value(name: str, default: Any) -> Any:
         attribute = prim.GetAttribute(name)
         value = attribute.Get(time) if attribute else None
-        return otherwise if value is None else value
+        return default if value is None else value
 
     kind = str(prim.GetTypeName())
     if kind == "Cube":
-        return _box(np.full(3, float(said("size", 2.0)) / 2))
+        return _box(np.full(3, float(attribute_value("size", 2.0)) / 2))
     radius, height = (
-        float(said("radius", 0.5 if kind == "Capsule" else 1.0)),
-        float(said("height", 1.0 if kind == "Capsule" else 2.0)),
+        float(attribute_value("radius", 0.5 if kind == "Capsule" else 1.0)),
+        float(attribute_value("height", 1.0 if kind == "Capsule" else 2.0)),
     )
-    made: dict[str, Callable[[], Outline]] = {
+    builders: dict[str, Callable[[], Outline]] = {
         "Sphere": lambda: _turned(*_ball(radius, 0.0)),
         "Capsule": lambda: _turned(*_ball(radius, height / 2)),
         "Cylinder": lambda: _turned(*_drum(radius, radius, height)),
         "Cone": lambda: _turned(*_drum(radius, 0.0, height)),
-        "Plane": lambda: _sheet(float(said("width", 2.0)), float(said("length", 2.0))),
+        "Plane": lambda: _sheet(float(attribute_value("width", 2.0)), float(attribute_value("length", 2.0))),
     }
-    found = made[kind]()
-    order = list(TURNS.get(str(said("axis", "Z")), TURNS["Z"]))
-    return Outline(found.points[:, order], found.sizes, found.vertices, found.normals[:, order])
+    shape = builders[kind]()
+    order = list(TURNS.get(str(attribute_value("axis", "Z")), TURNS["Z"]))
+    return Outline(shape.points[:, order], shape.sizes, shape.vertices, shape.normals[:, order])
 
 
 def _box(half: Float[np.ndarray, "3"]) -> Outline:
@@ -65,7 +65,7 @@ def _box(half: Float[np.ndarray, "3"]) -> Outline:
                 points.append(corner * half)
                 normals.append(np.eye(3)[axis] * side)
             vertices += range(len(points) - 4, len(points))
-    # Corners of equal place are one point: faces of a cube hang together.
+    # Corners at equal positions are one point: faces of a cube are connected.
     unique, inverse = np.unique(np.array(points), axis=0, return_inverse=True)
     return Outline(unique, np.full(6, 4), inverse.reshape(-1)[vertices], np.array(normals))
 
@@ -77,7 +77,7 @@ def _sheet(width: float, length: float) -> Outline:
 
 
 def _ball(radius: float, half: float) -> tuple[np.ndarray, np.ndarray]:
-    """Profiles (distance from the axis, height) and normals of a sphere whose halves stand apart by 2 · half."""
+    """Profiles (distance from the axis, height) and normals of a sphere whose halves are 2 · half apart."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, RINGS + 1)
     normals = np.stack([np.cos(angle), np.sin(angle)], axis=1).round(15) + 0.0  # the poles lie on the axis
     below, above = normals[: RINGS // 2 + 1], normals[RINGS // 2 :]
@@ -95,7 +95,7 @@ def _drum(low: float, high: float, height: float) -> tuple[np.ndarray, np.ndarra
 
 
 def _turned(profile: Float[np.ndarray, "s 2 2"], normals: Float[np.ndarray, "s 2 2"]) -> Outline:
-    """The surface that strips of a profile sweep about Z; strips of no extent are left out."""
+    """The surface that a profile's strips sweep about Z; degenerate strips are dropped."""
     keep = np.abs(profile[:, 0] - profile[:, 1]).max(axis=1) > 0
     profile, normals = profile[keep], normals[keep]
     angle = 2 * np.pi * np.arange(ROUND) / ROUND
@@ -103,8 +103,8 @@ def _turned(profile: Float[np.ndarray, "s 2 2"], normals: Float[np.ndarray, "s 2
     sizes, corners, directions = [], [], []
     for (low, high), (n_low, n_high) in zip(profile, normals, strict=True):
         for k in range(ROUND):
-            here, there = (c[k], s[k]), (c[(k + 1) % ROUND], s[(k + 1) % ROUND])
-            ring = [(low, here, n_low), (low, there, n_low), (high, there, n_high), (high, here, n_high)]
+            start, end = (c[k], s[k]), (c[(k + 1) % ROUND], s[(k + 1) % ROUND])
+            ring = [(low, start, n_low), (low, end, n_low), (high, end, n_high), (high, start, n_high)]
             ring = ring[1:] if low[0] == 0 else ring[:3] if high[0] == 0 else ring
             sizes.append(len(ring))
             corners += [(p[0] * at[0], p[0] * at[1], p[1]) for p, at, _ in ring]

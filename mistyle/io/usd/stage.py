@@ -1,7 +1,7 @@
-"""The stage of a USD file: opened with care, posed, and its meshes where they stand. Needs `usd-core`.
+"""The stage of a USD file: opening, skeleton pose, and its meshes in world space. Needs `usd-core`.
 
-Nothing is composed before usd_layers.py has seen every layer. Of point instancers each prototype comes once, where its
-first instance stands, since all instances show the same texels.
+layers.py checks every layer before composition. Each prototype of a point instancer is read once, at its first
+instance, since all instances show the same texels.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import TURNED
 from mistyle.io.sandbox.bounds import MAX_NODES, refuse
-from mistyle.io.usd.layers import check_layers, said
+from mistyle.io.usd.layers import check_layers, usd_message
 from mistyle.io.usd.shapes import is_shape
 
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -26,17 +26,19 @@ def open_stage(pxr: Any, path: Path) -> Any:
         stage = pxr.Usd.Stage.Open(str(path.resolve()))
         errors = stage.GetCompositionErrors()
     except pxr.Tf.ErrorException as error:
-        raise refuse(path, f"a stage that USD cannot open ({said(error)})", "a USD file", "Export it again") from None
+        raise refuse(
+            path, f"a stage that USD cannot open ({usd_message(error)})", "a USD file", "Export it again"
+        ) from None
     if errors:
-        found = f"a stage that does not compose ({str(errors[0]).strip().splitlines()[0][:160]})"
-        raise refuse(path, found, "references without cycles to prims that are there", "Flatten or repair the stage")
+        problem = f"a stage that does not compose ({str(errors[0]).strip().splitlines()[0][:160]})"
+        raise refuse(path, problem, "references without cycles to existing prims", "Flatten or repair the stage")
     return stage
 
 
 def pose(pxr: Any, stage: Any) -> None:
-    """Put skinned meshes into the pose of their skeletons at the first time; the file stays as it is."""
+    """Put skinned meshes into the pose of their skeletons at the first time; the file stays unchanged."""
     stage.SetEditTarget(stage.GetSessionLayer())
-    # Each prototype once and not at every instance: nested instances of a small file may be millions.
+    # Each prototype once, not at every instance: a small file may have millions of nested instances.
     prims = list(stage.Traverse())
     shared = [prim for prototype in stage.GetPrototypes() for prim in pxr.Usd.PrimRange(prototype)]
     moving = [p for p in (*prims, *shared) if p.IsA(pxr.UsdSkel.Animation)]
@@ -48,12 +50,12 @@ def pose(pxr: Any, stage: Any) -> None:
 
 
 def metres(pxr: Any, stage: Any) -> float:
-    """The stage's unit; numbers of another type than the schema's, which USD would refuse, count as well."""
+    """The stage's unit; accepts numbers of another type than the schema's, which USD refuses."""
     try:
         return float(pxr.UsdGeom.GetStageMetersPerUnit(stage))
     except pxr.Tf.ErrorException:
-        said = stage.GetRootLayer().pseudoRoot.GetInfo("metersPerUnit")
-        return float(said) if isinstance(said, int | float) else 0.01
+        value = stage.GetRootLayer().pseudoRoot.GetInfo("metersPerUnit")
+        return float(value) if isinstance(value, int | float) else 0.01
 
 
 def user_matrix(pxr: Any, stage: Any, notes: list[str]) -> Float[np.ndarray, "4 4"]:
@@ -71,7 +73,7 @@ def user_matrix(pxr: Any, stage: Any, notes: list[str]) -> Float[np.ndarray, "4 
 
 
 def mesh_prims(pxr: Any, stage: Any, path: Path, notes: list[str]) -> Iterator[tuple[Any, str, np.ndarray]]:
-    """(prim, what its instances share, world matrix for row vectors) of every mesh that is shown, in stage order."""
+    """(prim, path shared by its instances, world matrix for row vectors) of every visible mesh, in stage order."""
     time = pxr.Usd.TimeCode.EarliestTime()
     cache = pxr.UsdGeom.XformCache(time)
     every = pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)

@@ -1,4 +1,4 @@
-"""USD out: a mesh with UsdPreviewSurface materials, as text (.usda) and as one package (.usdz). Needs `usd-core`."""
+"""USD writer: a mesh with UsdPreviewSurface materials, as text (.usda) and as one package (.usdz). Needs `usd-core`."""
 
 import struct
 import zipfile
@@ -17,7 +17,7 @@ from mistyle.core.mesh import Mesh, local_origin
 from mistyle.io.materialx import TexturedMaterial
 
 NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "UsdValidation", "Vt")
-UTF8 = 1 << 11  # zip's flag for a name in UTF-8, without which readers take code page 437
+UTF8 = 1 << 11  # zip's flag for a name in UTF-8; without it readers assume code page 437
 FIRST_DAY = struct.pack("<HH", 0, 1 << 5 | 1)  # DOS time and date of 1980-01-01
 
 
@@ -31,12 +31,12 @@ def library() -> Any:
 
 @contextmanager
 def heard(pxr: Any) -> Iterator[list[str]]:
-    """Collects what USD would print on stderr: the list is filled at the end of the block."""
-    delegate, said = pxr.UsdUtils.CoalescingDiagnosticDelegate(), []
+    """Collects USD's diagnostics for stderr; fills the list at the end of the block."""
+    delegate, messages = pxr.UsdUtils.CoalescingDiagnosticDelegate(), []
     try:
-        yield said
+        yield messages
     finally:
-        said += [" ".join(entry.commentary.split()) for entry in delegate.TakeUncoalescedDiagnostics()]
+        messages += [" ".join(entry.commentary.split()) for entry in delegate.TakeUncoalescedDiagnostics()]
 
 
 def write_usd(
@@ -52,8 +52,8 @@ def write_usd(
 
     Normals and `primvars:st` (v up) are per corner, Y up, subdivision off. Textures are 8- or 16-bit files beside the
     stage: albedo sRGB, everything else raw; normals +Y. UDIM tiles are one texture with <UDIM> in its name, which the
-    preview surface reads; the UVs must lie in their tiles already. A mesh far from its origin has points about a local
-    one, which are float32, and a translation in double.
+    preview surface reads; the UVs must lie in their tiles. A mesh far from its origin has float32 points about a local
+    origin, and a translation in double.
     """
     pxr = library()
     path.unlink(missing_ok=True)
@@ -97,7 +97,7 @@ def write_usd(
 
 
 def define_material(pxr: Any, stage: Any, place: str, look: TexturedMaterial, primvar: str = "st") -> Any:
-    """A preview surface with the four textures of a look, looked up at `primvar`."""
+    """A preview surface with the four textures of a look at the UVs `primvar`."""
     material = pxr.UsdShade.Material.Define(stage, place)
     _titled(material, look.title)
     surface = _shader(pxr, stage, f"{place}/Surface", "UsdPreviewSurface")
@@ -112,17 +112,17 @@ def define_material(pxr: Any, stage: Any, place: str, look: TexturedMaterial, pr
     )
     for name, file, channel, kind, space in sockets:
         texture = _shader(pxr, stage, f"{place}/{name}", "UsdUVTexture")
-        named = texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset)
-        named.Set(f"./{file}")
+        file_input = texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset)
+        file_input.Set(f"./{file}")
         if name == "diffuseColor" and not look.srgb and look.space is not None:
-            # The preview surface knows raw and sRGB only; what the numbers are stands beside.
-            named.GetAttr().SetColorSpace(look.space.interop or look.space.name)
+            # The preview surface supports raw and sRGB only; the attribute's metadata names the actual space.
+            file_input.GetAttr().SetColorSpace(look.space.interop or look.space.name)
         texture.CreateInput("st", pxr.Sdf.ValueTypeNames.Float2).ConnectToSource(uv)
         texture.CreateInput("sourceColorSpace", pxr.Sdf.ValueTypeNames.Token).Set(space)
         for side in ("wrapS", "wrapT"):
             texture.CreateInput(side, pxr.Sdf.ValueTypeNames.Token).Set("repeat")
         if name == "normal":
-            # n = 2 c - 1, which 8-bit files need said.
+            # n = 2 c - 1, which 8-bit files require.
             texture.CreateInput("scale", pxr.Sdf.ValueTypeNames.Float4).Set((2, 2, 2, 1))
             texture.CreateInput("bias", pxr.Sdf.ValueTypeNames.Float4).Set((-1, -1, -1, 0))
         output = texture.CreateOutput(
@@ -134,7 +134,7 @@ def define_material(pxr: Any, stage: Any, place: str, look: TexturedMaterial, pr
 
 
 def _titled(schema: Any, title: str) -> None:
-    """Show the user's name where the prim's is another."""
+    """Set the user's name as display name where the prim's differs."""
     if title not in ("", schema.GetPrim().GetName()):
         schema.GetPrim().SetDisplayName(title)
 
@@ -146,7 +146,7 @@ def _shader(pxr: Any, stage: Any, place: str, kind: str) -> Any:
 
 
 def write_usdz(path: Path, stage: Path) -> None:
-    """The stage and everything it names in one package."""
+    """Write the stage and its dependencies as one package."""
     pxr = library()
     path.unlink(missing_ok=True)
     if not pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(stage)), str(path)):
@@ -155,10 +155,10 @@ def write_usdz(path: Path, stage: Path) -> None:
 
 
 def without_times(archive: Path) -> None:
-    """Write zip's first day, 1980-01-01, over the time of every file in an archive, in place: equal content is then
-    equal bytes, whenever it was packed. Names outside ASCII get the flag that says they are UTF-8."""
-    with zipfile.ZipFile(archive) as found:
-        entries, place = found.infolist(), found.start_dir
+    """Set the time of every file in an archive to zip's first day, 1980-01-01, in place, so that equal content gives
+    equal bytes. Names outside ASCII get the UTF-8 flag."""
+    with zipfile.ZipFile(archive) as package:
+        entries, place = package.infolist(), package.start_dir
     with open(archive, "rb+") as file:
 
         def mark(flags: int, day: int, name: str) -> None:
@@ -179,11 +179,11 @@ def without_times(archive: Path) -> None:
 
 
 def complaints(path: Path) -> list[str]:
-    """What USD's own validators have against a stage; empty where nothing."""
+    """Errors of USD's own validators for a stage; empty without errors."""
     pxr = library()
     stage = pxr.Usd.Stage.Open(str(path))
     registry = pxr.UsdValidation.ValidationRegistry()
     context = pxr.UsdValidation.ValidationContext(registry.GetOrLoadAllValidators())
-    found = context.Validate(stage)
+    errors = context.Validate(stage)
     serious = (pxr.UsdValidation.ValidationErrorType.Error,)
-    return [f"{e.GetName()}: {e.GetMessage()}" for e in found if e.GetType() in serious]
+    return [f"{e.GetName()}: {e.GetMessage()}" for e in errors if e.GetType() in serious]

@@ -108,7 +108,7 @@ def test_saturated_pixels_do_not_count(tmp_path, bits):
     nerf(tmp_path, [picture] * 3, bits)
     counts = read_captures(tmp_path).load(0)[1]
     assert not counts[2, 3] and counts.sum() == counts.size - 1
-    with pytest.raises(InputRefused, match="3 without a pixel that counts, of 3"):
+    with pytest.raises(InputRefused, match="3 without a valid pixel, of 3"):
         check_pixels(read_captures(tmp_path, saturation=0.85))
 
 
@@ -232,7 +232,11 @@ def test_black_and_empty_pictures_are_named():
     lights = [(Ambient((1.0, 1.0, 1.0)),)] * 3
     nothing = np.zeros(SIZE, bool)
     notes = check_pixels(in_memory(chosen, lights, [black, good, good], [~nothing, ~nothing, nothing]))
-    assert notes[0].startswith("v0: black") and notes[1].startswith("v2: no pixel counts") and len(notes) == 2
+    assert (
+        notes[0].startswith("v0: all valid pixels are black")
+        and notes[1].startswith("v2: no valid pixel")
+        and len(notes) == 2
+    )
     assert "fewer than 3" in check_pixels(in_memory(chosen[:2], lights[:2], [good, good]))[0]
     with pytest.raises(InputRefused, match="3 pictures that are black and 0 without"):
         check_pixels(in_memory(chosen, lights, [black] * 3))

@@ -205,8 +205,8 @@ def test_every_cut_is_noticed(tmp_path, rng):
     ("change", "reason"),
     [
         (lambda m: replace(m, images=[(*m.images[0][:2], 99, "a.png", 0)]), "camera 99 of the image 'a.png'"),
-        (lambda m: replace(m, images=[(np.zeros(4), *m.images[0][1:])]), "a pose that is none"),
-        (lambda m: replace(m, images=[(m.images[0][0], np.full(3, np.nan), *m.images[0][2:])]), "a pose that is none"),
+        (lambda m: replace(m, images=[(np.zeros(4), *m.images[0][1:])]), "an invalid pose"),
+        (lambda m: replace(m, images=[(m.images[0][0], np.full(3, np.nan), *m.images[0][2:])]), "an invalid pose"),
         (lambda m: replace(m, images=[]), "0 registered images"),
         (lambda m: replace(m, size=(0, 48)), "0 x 48 pixels"),
         (lambda m: replace(m, cameras={1: (0, "SIMPLE_PINHOLE", (-5.0, 1.0, 1.0))}), "focal length of -5"),

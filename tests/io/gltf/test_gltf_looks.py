@@ -410,7 +410,7 @@ def test_what_shows_its_emission_alone_has_it_as_albedo(tmp_path: Path) -> None:
     asset = read(file, tmp_path, uv="keep")
     index = (INNER * SIDE).astype(int)
     assert shown(asset, INNER) == pytest.approx(texels[index[:, 1], index[:, 0]] * [1, 0.5, 1], abs=1e-5)
-    assert noted(asset, "emission alone")
+    assert noted(asset, "only its emission")
     assert "missive" not in str(written(asset, tmp_path / "out.glb")[0])
 
 

@@ -171,7 +171,7 @@ def test_what_is_not_understood_is_said(tmp_path: Path) -> None:
     assert "No library has the material(s) 'none'; they were read as plain." in read_obj(path, 100).notes
     path.write_text(path.read_text().replace("usemtl none", "usemtl MAT"))
     raw = read_obj(path, 100)
-    assert raw.materials[0].name == "mat" and "Material 'MAT' was taken for 'mat' of its library." in raw.notes
+    assert raw.materials[0].name == "mat" and "Material 'MAT' was matched to 'mat' of its library." in raw.notes
 
 
 def test_neutral_statements_are_not_worth_a_note(tmp_path: Path) -> None:

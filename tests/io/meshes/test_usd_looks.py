@@ -89,7 +89,7 @@ FOR_BLUE = "    rel material:binding:{} = </R/B>\n"
 def test_bindings_by_purpose(bindings: str, name: str, tmp_path: Path) -> None:
     found = read(tmp_path, plate(bindings), RED, BLUE)
     assert [m.name for m in found.materials] == [name]
-    assert any("full renders alone" in note for note in found.notes) == (bindings == FOR_BLUE.format("full"))
+    assert any("only for full renders" in note for note in found.notes) == (bindings == FOR_BLUE.format("full"))
 
 
 @pytest.mark.parametrize(

@@ -369,7 +369,7 @@ def test_indices_and_numbers_are_checked(tmp_path):
         raw(path)
     short = INDEXED.replace("0, 1, 2, 3, 3, 2, 4", "0, 1, 2")
     found = raw(stage(tmp_path / "d.usda", mesh(extra=short)))
-    assert found.uvs is None and any("UVs of another number" in note for note in found.notes)
+    assert found.uvs is None and any("UVs were left out" in note for note in found.notes)
 
 
 def test_without_the_library_the_sentence_says_what_to_install(tmp_path, monkeypatch):

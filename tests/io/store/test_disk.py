@@ -53,7 +53,7 @@ def fails(code: int, where: str = ""):
     [
         (errno.ENOSPC, "", MistyleError, "disk is full.*Free some space"),
         (errno.EDQUOT, "x", MistyleError, "disk is full"),
-        (errno.EFBIG, "", MistyleError, "grew beyond what is allowed.*ulimit"),
+        (errno.EFBIG, "", MistyleError, "exceeded the allowed size.*ulimit"),
         (errno.EROFS, "x", UsageError, "cannot be written.*Choose another output folder"),
         (errno.EACCES, "x", UsageError, "cannot be written"),
         (errno.EIO, "x", MistyleError, "the disk, or the connection to it, failed"),
@@ -174,7 +174,9 @@ def test_compare_keeps_the_earlier_page_when_the_disk_fills(tmp_path, capsys):
     )
     line = [sys.executable, "-c", code, "compare", picture, picture, "-o", str(out), "--metrics", "psnr"]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 1 and "grew beyond" in done.stderr and "Traceback" not in done.stderr, done.stderr
+    assert done.returncode == 1 and "exceeded the allowed size" in done.stderr and "Traceback" not in done.stderr, (
+        done.stderr
+    )
     assert {name: (out / name).read_bytes() for name in names(out) if (out / name).is_file()} == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "small.png"]
 

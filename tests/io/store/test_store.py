@@ -83,7 +83,7 @@ def test_full_disk_is_a_sentence_and_leaves_nothing(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full is a Linux device")
 def test_real_full_device():
     with pytest.raises(MistyleError, match="disk is full"):
-        with disk_errors.told(Path("x")), open("/dev/full", "wb") as file:
+        with disk_errors.translated(Path("x")), open("/dev/full", "wb") as file:
             file.write(b"x" * 100_000)
 
 
