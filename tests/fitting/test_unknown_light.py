@@ -145,7 +145,7 @@ def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
     by_light = [rng.random((rows, cells)).astype(np.float32) * own.used[:, None] for _ in range(3)]
     wrong = rng.normal(0, 1, (rows, 3)) * own.used[:, None]
     values = light_solve.first_values(own) + rng.normal(0, 0.1, (count, 7)).astype(np.float32)
-    lost, slope = light_solve._followed(own, values, by_texel, by_light, wrong)
+    lost, slope = light_solve._schur_terms(own, values, by_texel, by_light, wrong)
     told = np.flatnonzero(own.observed.seen >= recover_prior.LEAST_SEEN)
     expected, pulled = np.zeros((3 * cells, 3 * cells)), np.zeros(3 * cells)
     prior = np.diag(np.array(light_solve.SPREAD) ** -2.0)
@@ -183,7 +183,7 @@ def test_small_pictures_are_means_over_what_counts(captures):
     rgb, mask = captures.load(0)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(unknown_light, "SIDE", 48)
-        camera, small, counts = unknown_light._small(captures, 0)
+        camera, small, counts = unknown_light._downsampled(captures, 0)
     assert camera.size == (48, 48) and counts.any() and not counts.all()
     means = resize(np.where(mask[..., None], rgb, 0), (48, 48))
     assert np.abs(small - means)[counts].max() < 0.05 * max(float(rgb.max()), 1)
