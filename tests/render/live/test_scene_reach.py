@@ -257,7 +257,7 @@ def test_every_value_is_printed_and_written_where_mitsuba_finds_it(house, tmp_pa
     page = (tmp_path / "out" / "report" / "index.html").read_text("utf-8")
     rows = {row["name"]: row for row in record["values"]}
     assert record["settings"]["spp"] == 4 and record["settings"]["loss"] == "auto"
-    assert any("image.RGB are taken" in note for note in record["notes"])
+    assert any("image.RGB are used" in note for note in record["notes"])
     assert any("is render noise" in note for note in record["notes"])
     shown = mi.traverse(mi.load_file(record["scene"], optimize=False))
     for key, value in true.items():

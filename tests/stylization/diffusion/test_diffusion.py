@@ -465,7 +465,7 @@ def test_a_wrong_style_lora_is_refused(tmp_path, loras):
     refused(tmp_path, "no LoRA weights for up_blocks.0.attentions.1", style_lora=tmp_path / "other.safetensors")
     wide = {k: torch.zeros(4, 1280) if "down" in k else v for k, v in tensors.items()}
     save_file(wide, tmp_path / "wide.safetensors")
-    refused(tmp_path, "take 1280 numbers, the base model has 64", style_lora=tmp_path / "wide.safetensors")
+    refused(tmp_path, "take 1280 channels, expected 64", style_lora=tmp_path / "wide.safetensors")
     refused(tmp_path, "or the guidance", QUICK.model_copy(update={"style_guidance": 1.0}), UsageError)
 
 
