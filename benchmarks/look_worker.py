@@ -12,6 +12,7 @@ import os
 import shutil
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,9 @@ from typing import Any
 def command_line() -> Any:
     """The tree's own `main(arguments)`."""
     try:
-        from mistyle.cli import main  # pyright: ignore[reportMissingImports]
-    except ImportError:
         from mistyle.cli.main import main
+    except ImportError:  # a tree of before the packages
+        main = import_module("mistyle.run.cli").main
     return main
 
 

@@ -21,9 +21,9 @@ from benchmarks.look_paint import DATA, ROOT, Tree, environment, this_tree, tree
 
 MAIN = """import sys
 try:
-    from mistyle.cli import main
-except ImportError:
     from mistyle.cli.main import main
+except ImportError:  # a tree of before the packages
+    from mistyle.run.cli import main
 sys.exit(main(sys.argv[1:]))"""
 JOBS = ("draft", "standard", "demo", "materials", "preview")
 REPORTED = ("draft", "standard", "materials")  # whose report counts
