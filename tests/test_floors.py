@@ -59,7 +59,7 @@ MANY = {
     "stylization.pipeline.stylize.refined_stages",
     "stylization.pipeline.stylize.repair",
 }
-TWICE = 8  # class names that may be used twice
+TWICE = 3  # class names that may be used twice
 PAPER_LINES = 31_300  # the goal is 27,000
 
 

@@ -19,7 +19,7 @@ AROUND = 6  # neighbours of a cell
 
 
 @dataclass(frozen=True)
-class EnvironmentCells:
+class LightCells:
     """Every direction belongs to the nearest of k unit vectors (world, towards the light).
 
     angle  solid angle of each cell
@@ -43,21 +43,21 @@ class EnvironmentCells:
 Radiance = Float[np.ndarray, "k 3"]
 
 
-def cells_at(directions: Float[np.ndarray, "k 3"]) -> EnvironmentCells:
+def cells_at(directions: Float[np.ndarray, "k 3"]) -> LightCells:
     """The Voronoi cells of these directions; their solid angles are measured on the direction grid."""
     towards, angle = _sphere()
     own = np.bincount(_owners(directions, towards), angle, minlength=len(directions))
     near = np.asarray(KDTree(directions).query(directions, AROUND + 1)[1])[:, 1:]
     both = np.stack([np.repeat(np.arange(len(directions)), AROUND), near.ravel()], axis=1)
-    return EnvironmentCells(directions, np.maximum(own, 1e-6), np.unique(np.sort(both, axis=1), axis=0))
+    return LightCells(directions, np.maximum(own, 1e-6), np.unique(np.sort(both, axis=1), axis=0))
 
 
-def even_cells() -> EnvironmentCells:
+def even_cells() -> LightCells:
     """CELLS cells of nearly equal size."""
     return cells_at(even_directions(CELLS).astype(float))
 
 
-def refined(cells: EnvironmentCells, radiance: Radiance) -> tuple[EnvironmentCells, Float[np.ndarray, "n 3"]]:
+def refined(cells: LightCells, radiance: Radiance) -> tuple[LightCells, Float[np.ndarray, "n 3"]]:
     """CELLS even cells, FINE more in proportion to the old cells' energy, and the radiance resampled to them."""
     energy = luminance(radiance) * cells.angle
     share = FINE * energy / max(float(energy.sum()), 1e-20)
@@ -71,7 +71,7 @@ def refined(cells: EnvironmentCells, radiance: Radiance) -> tuple[EnvironmentCel
     return new, np.stack(total, axis=1) / new.angle[:, None]
 
 
-def environment_of(cells: EnvironmentCells, radiance: Radiance) -> Environment:
+def environment_of(cells: LightCells, radiance: Radiance) -> Environment:
     """The environment map of the cells' radiance, ROWS x 2 ROWS."""
     towards = environment_directions(ROWS, 2 * ROWS)
     own = _owners(cells.direction, towards.reshape(-1, 3))
@@ -83,7 +83,7 @@ def _owners(middles: Float[np.ndarray, "k 3"], towards: Float[np.ndarray, "n 3"]
     return np.asarray(KDTree(middles).query(towards)[1])
 
 
-def _within(cells: EnvironmentCells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
+def _within(cells: LightCells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
     """Even directions (Fibonacci spiral) over a disc at the centre of cell k with the cell's solid angle."""
     middle = cells.direction[k]
     across = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])

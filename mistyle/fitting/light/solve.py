@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.fitting.light.cells import EnvironmentCells, Radiance
+from mistyle.fitting.light.cells import LightCells, Radiance
 from mistyle.render.deferred.material_table import ALBEDO, ROUGHNESS, TILT
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.prior import LEAST_SEEN
@@ -46,7 +46,7 @@ class Bundle:
     LEAST_SEEN observations, `free` the number of free unknowns per texel."""
 
     observed: TexelObservations
-    cells: EnvironmentCells
+    cells: LightCells
     problem: Problem
     owner: Int[np.ndarray, " o"]
     used: Bool[np.ndarray, " o"]
@@ -68,7 +68,7 @@ def bundle(
     traced: Tracer,
     observed: TexelObservations,
     normal: Float[np.ndarray, "t 3"],
-    cells: EnvironmentCells,
+    cells: LightCells,
     options: Options,
 ) -> Bundle:
     """The problem with these cells as the environment; `normal` is the geometric normal of the texels."""
@@ -246,7 +246,7 @@ def _schur_terms(
     return schur, slope
 
 
-def _smoothness(cells: EnvironmentCells, radiance: Radiance) -> Float[np.ndarray, "n n"]:
+def _smoothness(cells: LightCells, radiance: Radiance) -> Float[np.ndarray, "n n"]:
     """Quadratic form of neighbours' squared differences relative to their brightness: lamps may have sharp edges."""
     bright, count = radiance.mean(axis=1), len(cells.angle)
     i, j = cells.pairs.T
@@ -258,7 +258,7 @@ def _smoothness(cells: EnvironmentCells, radiance: Radiance) -> Float[np.ndarray
     return np.kron(np.eye(3), one)
 
 
-def _means(cells: EnvironmentCells, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 n"]:
+def _means(cells: LightCells, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 n"]:
     """Rows that give each channel's mean radiance relative to `target`."""
     share = cells.angle / cells.angle.sum()
     return np.kron(np.diag(1 / np.maximum(target, 1e-12)), share)
