@@ -153,6 +153,12 @@ def shrunk(data: bytes, where: str, longest: int, quality: int) -> tuple[bytes, 
     return buffer.getvalue(), "image/jpeg"
 
 
+def named_alpha(where: Path, roots: Sequence[Path], name: str) -> Float[np.ndarray, "h w"] | None:
+    """The alpha 0..1 of the texture that `named_texture` found; None where it is opaque."""
+    target = named_file(where, roots, name)[0]
+    return None if target is None else alpha_of(read_bytes(target, MAX_PICTURE_BYTES), str(target))
+
+
 def alpha_of(data: bytes, where: str) -> Float[np.ndarray, "h w"] | None:
     """The alpha 0..1 of a texture; None where it has none, is opaque, or is not a picture."""
     try:

@@ -1,32 +1,34 @@
 """Material libraries of Wavefront OBJ (MTL, with its extension for physically based materials)."""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from mistyle.core.asset import Shading
 from mistyle.geometry.retexture import REPEAT
 from mistyle.io.images.quantisation import Kind, fractions, linear_rows
-from mistyle.io.images.read import Budget, named_texture
+from mistyle.io.images.read import Budget, named_alpha, named_texture
 from mistyle.io.meshes.parsed_mesh import Maps, RawMap, RawMaterial, no_textures
 from mistyle.io.sandbox.bounds import read_bytes
 from mistyle.io.sandbox.nearby import decoded, unmarked
 
 MAX_LIBRARY_BYTES = 16 << 20
 TEXTURES = {"map_kd": "albedo", "map_pr": "roughness", "map_pm": "metallic", "norm": "normal"}
+TEXTURES |= {"map_d": "opacity", "map_ke": "emission"}
 BUMPS = ("map_bump", "bump")
 NAMING = {*TEXTURES, *BUMPS}  # statements whose pictures are opened
 # Options of a texture statement and their numbers of values; the file name follows them.
 OPTIONS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-blendu": 1, "-blendv": 1, "-boost": 1, "-texres": 1}
 OPTIONS |= {"-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1, "-colorspace": 1}
 # Statements without a note: read, or without effect on a ray-traced surface.
-READ = {*NAMING, "kd", "pr", "pm", "ka", "ni", "illum", "sharpness", "map_aat"}
-OPACITY = {"d": 1.0, "tr": 0.0}
-NEUTRAL = {"tf": 1.0, "ks": 0.0, "ke": 0.0, "ps": 0.0, "pc": 0.0, "pcr": 0.0, "aniso": 0.0, "anisor": 0.0} | OPACITY
+READ = {*NAMING, "kd", "pr", "pm", "d", "tr", "ke", "ka", "ni", "illum", "sharpness", "map_aat"}
+NEUTRAL = {"tf": 1.0, "ks": 0.0, "ps": 0.0, "pc": 0.0, "pcr": 0.0, "aniso": 0.0, "anisor": 0.0}
+NUMBERS = {"kd": 3, "ke": 3, "d": 1, "tr": 1}  # values of the statements whose odd forms get a note
 # Names of linear colour spaces; all others are read as sRGB, with a note for names that are not sRGB.
 LINEAR = ("linear", "raw", "lin_rec709", "lin_srgb", "non-color", "data", "none")
 SRGB = ("srgb", "srgb_texture", "auto", "gamma22", "rec709")
@@ -93,12 +95,12 @@ def read_library(library: Path, mesh: Path) -> tuple[dict[str, MtlEntry], tuple[
 
 
 def material(entry: MtlEntry, budget: Budget) -> RawMaterial:
-    """The raw material. Kd applies only without map_Kd (many exporters write Kd 0 or 0.8 beside a texture), as do Pr
-    and Pm."""
+    """The raw material. Kd applies only without map_Kd (many exporters write Kd 0 or 0.8 beside a texture), as do Pr,
+    Pm, d and Ke without their textures."""
     named = {TEXTURES[k]: statement(v) for k, v in entry.values.items() if k in TEXTURES}
     bump = next((statement(entry.values[k]) for k in BUMPS if k in entry.values), None)
     textures = named | ({"bump": bump} if bump is not None else {})
-    colour = [1.0, 1.0, 1.0] if "albedo" in named else _colour(entry)
+    colour = [1.0, 1.0, 1.0] if "albedo" in named else _triple(entry, "kd", 1.0)
     rough = 1.0 if "roughness" in named else _numbers(entry, "pr", [0.5])[0]
     metal = 1.0 if "metallic" in named else _numbers(entry, "pm", [0.0])[0]
     tiled = any(tile_name(texture.file, 1001) is not None for texture in textures.values())
@@ -110,19 +112,38 @@ def material(entry: MtlEntry, budget: Budget) -> RawMaterial:
         (red, green, blue),
         float(np.clip(rough, 0, 1)),
         float(np.clip(metal, 0, 1)),
+        _shading(entry, named),
     )
 
 
+def _shading(entry: MtlEntry, named: Mapping[str, Statement]) -> Shading:
+    """Opacity (d, or 1 - Tr where d is absent) and emission (Ke, which may exceed 1)."""
+    opacity = _numbers(entry, "d", [1.0 - _numbers(entry, "tr", [0.0])[0]])[0]
+    red, green, blue = [1.0] * 3 if "emission" in named else (max(c, 0.0) for c in _triple(entry, "ke", 0.0))
+    return Shading(opacity=1.0 if "opacity" in named else float(np.clip(opacity, 0, 1)), emission=(red, green, blue))
+
+
 def unread(entries: Sequence[MtlEntry]) -> list[str]:
-    """Notes on the statements of materials that change how they look and were not read."""
+    """Notes on the statements of materials that change how they look and were not read, or are not painted."""
     notes, skipped = [], {}
     for entry in entries:
-        if "map_d" in entry.values or any(_changes(entry, key) for key in OPACITY):
-            notes.append(f"The opacity of material '{entry.name}' was not read.")
+        shading, textures = _shading(entry, {}), [key for key in ("map_d", "map_ke") if key in entry.values]
+        drawn = ["opacity"] * (shading.opacity < 1 or "map_d" in textures)
+        drawn += ["emission"] * (any(shading.emission) or "map_ke" in textures)
+        if drawn:
+            notes.append(
+                f"The {' and '.join(drawn)} of material '{entry.name}' shows in lookdev and compare; "
+                "views, paintings and finished assets omit it."
+            )
+        if {"d", "tr"} <= set(entry.values):
+            dissolve, transparency = (_numbers(entry, key, [np.nan])[0] for key in ("d", "tr"))
+            if abs(dissolve + transparency - 1) > 0.01:
+                notes.append(f"Material '{entry.name}' states both d and Tr, which disagree; d was read.")
         for key in entry.values:
-            ignored = key not in READ and key not in OPACITY and key != "map_d" and _changes(entry, key)
-            odd = key == "kd" and "map_kd" not in entry.values and np.isnan(_numbers(entry, key, [np.nan])[0])
-            if ignored or odd:  # odd: a spectrum
+            ignored = key not in READ and _changes(entry, key)
+            # Odd: a spectrum, or a halo.
+            odd = key in NUMBERS and f"map_{key}" not in entry.values and _is_odd(entry, key)
+            if ignored or odd:
                 skipped.setdefault(entry.library.name, {})[entry.spelled[key]] = None
     sentences = (f"{library}: these statements were not read: {', '.join(keys)}." for library, keys in skipped.items())
     return [*notes, *sentences]
@@ -143,10 +164,16 @@ def _changes(entry: MtlEntry, key: str) -> bool:
         return True
 
 
-def _colour(entry: MtlEntry) -> list[float]:
-    """Kd: three numbers, or one for all."""
-    grey = _numbers(entry, "kd", [1.0])
-    return grey * 3 if len(entry.values.get("kd", "").split()) == 1 else _numbers(entry, "kd", [1.0] * 3)
+def _triple(entry: MtlEntry, key: str, default: float) -> list[float]:
+    """A colour: three numbers, or one for all."""
+    count = 1 if len(entry.values.get(key, "").split()) == 1 else 3
+    return _numbers(entry, key, [default] * count) * (3 // count)
+
+
+def _is_odd(entry: MtlEntry, key: str) -> bool:
+    """Whether a statement's values are no numbers."""
+    count = min(NUMBERS[key], len(entry.values[key].split()))
+    return bool(np.isnan(_numbers(entry, key, [np.nan] * count)[0]))
 
 
 def _numbers(entry: MtlEntry, key: str, default: list[float]) -> list[float]:
@@ -206,6 +233,9 @@ def _load(textures: dict[str, Statement], entry: MtlEntry, budget: Budget, tile:
         pixels = named_texture(entry.library, entry.roots, file, budget, notes)
         if pixels is None:
             continue
+        if name == "opacity":
+            maps[name] = _opacity(stmt, *pixels, named_alpha(entry.library, entry.roots, file), notes)
+            continue
         entry_map = _converted("normal" if name == "bump" else name, stmt, *pixels, notes)
         if name == "bump" and not _is_normal_map(pixels[0]):
             notes.append(f"Bump map {file} holds heights, not normals, and was left out.")
@@ -220,8 +250,9 @@ def _converted(name: str, stmt: Statement, pixels: np.ndarray, linear: bool, not
         notes.append(f"The turbulence (-t) of texture {stmt.file} was not read.")
     if stmt.space and stmt.space not in (*LINEAR, *SRGB):
         notes.append(f"The colour space {stmt.space} of texture {stmt.file} is not known and was not read.")
-    kind: Kind = "colour" if name == "albedo" else "normal" if name == "normal" else "data"
-    if name == "albedo" and (linear or stmt.space in LINEAR):
+    colour = name in ("albedo", "emission")
+    kind: Kind = "colour" if colour else "normal" if name == "normal" else "data"
+    if colour and (linear or stmt.space in LINEAR):
         kind, pixels = "data", np.clip(fractions(pixels), 0, 1)
     elif kind == "data":
         pixels = np.clip(pixels, 0, 1) if linear else pixels
@@ -235,6 +266,21 @@ def _converted(name: str, stmt: Statement, pixels: np.ndarray, linear: bool, not
         scale=stmt.strength if kind == "normal" else 1.0,
         wrap=("clamp", "clamp") if stmt.clamp else REPEAT,
     )
+
+
+def _opacity(
+    stmt: Statement, pixels: np.ndarray, linear: bool, alpha: Float[np.ndarray, "h w"] | None, notes: list[str]
+) -> RawMap:
+    """The coverage of a map_d: the channel that it names, else the picture's alpha, else its luminance.
+
+    MTL's default is the luminance, but a picture with transparency is nearly always meant by its alpha: a note says so.
+    """
+    if alpha is None or stmt.channel not in ("", "m"):
+        by_channel = replace(stmt, channel="l" if stmt.channel in ("", "m") else stmt.channel)
+        return _converted("opacity", by_channel, pixels, linear, notes)
+    if not stmt.channel:
+        notes.append(f"The opacity of texture {stmt.file} was read from its alpha channel.")
+    return _converted("opacity", replace(stmt, channel="", space=""), np.repeat(alpha[..., None], 3, 2), True, notes)
 
 
 def _channel(pixels: Shaped[np.ndarray, "h w 3"], stmt: Statement, notes: list[str]) -> Shaped[np.ndarray, "h w"]:

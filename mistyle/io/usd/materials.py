@@ -133,7 +133,8 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
     unpainted = [n for n in UNPAINTED if _differs(_source(pxr, surface.GetInput(n), time), UNPAINTED[n])]
     if unpainted:
         notes.append(
-            f"The {' and '.join(unpainted)} of material '{name}' is drawn; paintings and finished assets omit it."
+            f"The {' and '.join(unpainted)} of material '{name}' shows in lookdev and compare; "
+            "views, paintings and finished assets omit it."
         )
     if _source(pxr, surface.GetInput("useSpecularWorkflow"), time):
         notes.append(f"Material '{name}' has the specular workflow: it is drawn so, and painted as not metallic.")

@@ -162,8 +162,9 @@ def test_what_is_not_understood_is_said(tmp_path: Path) -> None:
     path = square(tmp_path, mtl, head="#comment\nmtllib m.mtl\ns 1\nl 1 2\nfoo 1\n")
     raw = read_obj(path, 100)
     assert raw.notes == (
-        "The opacity of material 'mat' was not read.",
-        "m.mtl: these statements were not read: Ks, Ns, map_Ke, wibble.",
+        "The opacity and emission of material 'mat' shows in lookdev and compare; "
+        "views, paintings and finished assets omit it.",
+        "m.mtl: these statements were not read: Ks, Ns, wibble.",
         "Lines and points were left out.",
         "Statements that OBJ does not have were left out: 'foo'.",
     )
@@ -177,6 +178,47 @@ def test_what_is_not_understood_is_said(tmp_path: Path) -> None:
 def test_neutral_statements_are_not_worth_a_note(tmp_path: Path) -> None:
     mtl = "newmtl mat\nKd 1 1 1\nKa 1 1 1\nKs 0 0 0\nNs 10\nKe 0.0 0 0\nTf 1 1 1\nNi 1.5\nd 1.0\nTr 0\nillum 2\n"
     assert read_obj(square(tmp_path, mtl), 100).notes == ()
+
+
+STATED = {
+    "d 0.25\n": (0.25, (0, 0, 0)),
+    "Tr 0.25\n": (0.75, (0, 0, 0)),
+    "d 0.5\nTr 0.25\nKe 2 0.5 0\n": (0.5, (2, 0.5, 0)),
+    "Ke 3\nd 4\n": (1, (3, 3, 3)),
+}
+
+
+@pytest.mark.parametrize("mtl", STATED)
+def test_opacity_and_emission_are_read(mtl: str, tmp_path: Path) -> None:
+    asset = read_mesh(square(tmp_path, f"newmtl mat\nKd 1 1 1\n{mtl}"), uv="keep")
+    shading = asset.materials[0].shading
+    assert (shading.opacity, shading.emission) == STATED[mtl]
+    told = " ".join(asset.source.notes)
+    assert "shows in lookdev and compare; views, paintings and finished assets omit it" in told
+    assert ("disagree; d was read" in told) == ("Tr" in mtl and "d 0.5" in mtl)
+
+
+def test_halos_are_said(tmp_path: Path) -> None:
+    asset = read_mesh(square(tmp_path, "newmtl mat\nKd 1 1 1\nd -halo 0.5\n"), uv="keep")
+    assert asset.materials[0].shading.opacity == 1
+    assert "m.mtl: these statements were not read: d." in asset.source.notes
+
+
+@pytest.mark.parametrize(
+    ("statement", "expected", "told"),
+    [("leaf.png", 51, True), ("-imfchan m leaf.png", 51, False), ("-imfchan l leaf.png", 204, False),
+     ("-imfchan r leaf.png", 204, False), ("mask.png", 102, False)],
+)  # fmt: skip
+def test_opacity_textures(statement: str, expected: int, told: bool, tmp_path: Path) -> None:
+    Image.new("RGBA", (4, 4), (204, 204, 204, 51)).save(tmp_path / "leaf.png")
+    Image.new("L", (4, 4), 102).save(tmp_path / "mask.png")
+    Image.new("RGB", (4, 4), (188, 188, 0)).save(tmp_path / "glow.png")
+    path = square(tmp_path, f"newmtl mat\nd 0\nKe 0 0 0\nmap_d {statement}\nmap_Ke glow.png\n")
+    material = read_mesh(path, uv="keep").materials[0]
+    assert material.opacity is not None and material.emission is not None
+    assert material.opacity == pytest.approx(expected / 255, abs=1e-3) and material.shading.opacity == 1
+    assert material.emission[0, 0] == pytest.approx([0.503, 0.503, 0], abs=2e-3)
+    assert any("from its alpha channel" in n for n in read_mesh(path, uv="keep").source.notes) == told
 
 
 KD = {"0.5": (0.5, 0.5, 0.5), "0.1 0.2 0.3": (0.1, 0.2, 0.3), "spectral a.rfl 1": (1, 1, 1)}

@@ -176,7 +176,10 @@ def test_what_is_not_painted_is_said(tmp_path: Path) -> None:
     found = read(tmp_path, plate(BOUND + see_through), material(inputs))
     assert found.materials[0].metallic_factor == 0
     told = " ".join(found.notes)
-    assert "specular workflow" in told and "emissiveColor and clearcoat and opacity of material 'M' is drawn" in told
+    assert (
+        "specular workflow" in told
+        and "emissiveColor and clearcoat and opacity of material 'M' shows in lookdev" in told
+    )
     shading = found.materials[0].shading
     assert (shading.opacity, shading.emission, shading.coat, shading.specular) == (0.5, (0, 2, 0), 0.5, (1, 0, 0))
     assert "displayOpacity" not in told
