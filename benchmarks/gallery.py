@@ -15,12 +15,14 @@ pictures in OUT/cycles, so that a second run draws only our side.
     notes    text of a note of mistyle's -> reason: a model whose notes have that text is explained by them
     models   model -> {"reason", and "note" or "by"}. With "note", the reason holds as long as a note of this run has
              that text. "by": "cycles" says that Blender's side departs from the file or from its specification,
-             "by": "noise" that more samples bring the pictures together.
+             "by": "noise" that more samples bring the pictures together. "mend" names what is corrected in
+             Blender's import for this model (gallery_mended_worker.py): it is drawn as its specification says.
 
 Figures: models (drawn by both), within_flip_005 (mean FLIP of the whole picture up to 0.05), share_within,
 within_on_model (the same of the mean over the pixels that either picture covers, which no background dilutes),
 silent_differences (beyond 0.05, and neither a note nor a reason with "by" explains it), cycles_departs (beyond 0.05
-because Blender departs from the specification; they count as misses) and, not among the models, refused (by mistyle,
+because Blender departs from the specification; they count as misses), mended (models whose import into Blender was
+corrected) and, not among the models, refused (by mistyle,
 with a sentence) and cycles_failed. --judge draws nothing and judges the last list of OUT again.
 OUT/index.html and OUT/gallery.json list every model with both pictures, FLIP, notes and reason, worst first. Ends with
 1 where a difference is silent.
@@ -62,6 +64,7 @@ class Row:
     flip         mean FLIP of the whole picture, on_model of what either picture covers; None where one is missing
     reason       why it differs, "" where nobody knows; explained: whether a note or Blender's own departure says so
     by           who departs from the specification, where `BY` says so
+    mend         what was corrected in Blender's import, "" for nothing
     notes        the reader's sentences, or the one of a refusal (refused); trouble: why Blender made no picture
     """
 
@@ -76,6 +79,7 @@ class Row:
     ours: str
     cycles: str
     by: str = ""
+    mend: str = ""
 
     @property
     def within(self) -> bool:
@@ -131,6 +135,7 @@ def row(drawn: Drawn, folder: Path, reasons: Mapping[str, Any]) -> Row:
         refused=drawn.refused,
         ours=shown.get("ours", ""),
         cycles=shown.get("cycles", ""),
+        mend=drawn.mend,
     )
     return judged(found, reasons)
 
@@ -155,6 +160,7 @@ def tally(rows: Sequence[Row]) -> dict[str, float]:
         "within_on_model": sum(r.on_model is not None and r.on_model <= LIMIT for r in compared),
         "silent_differences": sum(r.silent for r in compared),
         "cycles_departs": sum(not r.within and r.by == "cycles" for r in compared),
+        "mended": sum(bool(r.mend) for r in compared),
         "refused": sum(r.refused for r in rows),
         "cycles_failed": sum(bool(r.trouble) for r in rows),
     }
@@ -212,8 +218,9 @@ def drawn_rows(given: argparse.Namespace) -> list[Row]:
         raise UsageError("needs --blender PYTHON or $MISTYLE_BLENDER_PYTHON: a Python in which `import bpy` works")
     size, samples = (96, 16) if given.quick else (256, 32)
     names = models_of(given.models, given.list, given.only)
-    jobs = draw_ours(given.models, names, given.out, size, samples)
     reasons = read_json(REASONS)
+    models = {name: reasons["models"].get(name, {}).get("mend", "") for name in names}
+    jobs = draw_ours(given.models, models, given.out, size, samples)
     return [row(drawn, given.out, reasons) for drawn in draw_cycles(jobs, given.out, blender)]
 
 

@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ LIGHTS = (
     SphericalGaussian((0.6, 0.0, 0.8), 12.0, (0.8, 0.6, 0.5)),
 )
 WORKER = str(Path(__file__).with_name("gallery_worker.py"))
+MENDED = str(Path(__file__).with_name("gallery_mended_worker.py"))
 TRIES = 20  # crashes of Blender that are lived with
 
 
@@ -42,6 +43,7 @@ class Drawn:
     refused   whether mistyle refused it
     job       Blender's job (see mistyle/render/external/cycles_worker.py); None where there is no camera for it
     trouble   why Blender made no picture
+    mend      what was corrected in Blender's import (gallery_mended_worker.py), "" for nothing
     """
 
     model: str
@@ -52,10 +54,11 @@ class Drawn:
     theirs: Float[np.ndarray, "h w 4"] | None = None
     job: dict[str, Any] | None = None
     trouble: str = ""
+    mend: str = ""
 
 
-def draw_ours(folder: Path, names: Sequence[str], out: Path, size: int, samples: int) -> list[Drawn]:
-    """Read and draw every model; a refusal is a result."""
+def draw_ours(folder: Path, models: Mapping[str, str], out: Path, size: int, samples: int) -> list[Drawn]:
+    """Read and draw every model (name -> mend); a refusal is a result."""
     from mistyle.render.lookdev import scenes as lookdev
 
     camera = orbit(35.0, 15.0, distance=4.0, fov=30.0, size=(size, size))
@@ -63,9 +66,9 @@ def draw_ours(folder: Path, names: Sequence[str], out: Path, size: int, samples:
     sky = lookdev.blender_environment(LIGHTS)
     write_exr(environment, dict(zip("RGB", np.moveaxis(sky, -1, 0), strict=True)))
     result = []
-    for k, name in enumerate(names):
-        print(f"{k + 1}/{len(names)} {name}", file=sys.stderr, flush=True)
-        result.append(_ours(folder / name, name, camera, samples, environment))
+    for k, (name, mend) in enumerate(models.items()):
+        print(f"{k + 1}/{len(models)} {name}", file=sys.stderr, flush=True)
+        result.append(replace(_ours(folder / name, name, camera, samples, environment), mend=mend))
     return result
 
 
@@ -105,33 +108,44 @@ def _job(path: Path, asset: Asset, camera: Camera, samples: int, environment: Pa
 
 def draw_cycles(drawn: Sequence[Drawn], out: Path, blender: str) -> list[Drawn]:
     """Blender's pictures, kept in out/cycles under the contents of their jobs and files."""
-    from mistyle.render.lookdev.scenes import CYCLES_WORKER
-
     folder = out / "cycles"
     folder.mkdir(parents=True, exist_ok=True)
     places = [_place(folder, d) for d in drawn]
-    jobs = [
-        d.job | {"shots": [d.job["shots"][0] | {"out": str(place.resolve())}]}
-        for d, place in zip(drawn, places, strict=True)
-        if d.job is not None
-    ]
+    pairs = list(zip(drawn, places, strict=True))
+    _run(blender, WORKER, [_shot(d, place) for d, place in pairs if d.job is not None and not d.mend], folder)
+    _run(blender, MENDED, [_shot(d, place) for d, place in pairs if d.job is not None and d.mend], folder)
+    return [_with_theirs(d, place) for d, place in pairs]
+
+
+def _shot(drawn: Drawn, place: Path) -> dict[str, Any]:
+    assert drawn.job is not None
+    shots = [drawn.job["shots"][0] | {"out": str(place.resolve())}]
+    return drawn.job | {"shots": shots} | ({"mend": drawn.mend} if drawn.mend else {})
+
+
+def _run(blender: str, worker: str, jobs: Sequence[dict[str, Any]], folder: Path) -> None:
+    """One worker over its jobs, started again after each crash of Blender."""
+    from mistyle.render.lookdev.scenes import CYCLES_WORKER
+
+    if not jobs:
+        return
     order = folder / f"jobs_{os.getpid()}.json"
     order.write_text(json.dumps({"settings": str(Path(CYCLES_WORKER).parent), "jobs": jobs}))
     # What leads this process to its own packages would lead Blender's environment astray.
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
     for _ in range(TRIES):
-        done = subprocess.run([*blender_command(blender, WORKER), str(order)], env=clean, check=False)
+        done = subprocess.run([*blender_command(blender, worker), str(order)], env=clean, check=False)
         if done.returncode >= 0:
             break
-    return [_with_theirs(d, place) for d, place in zip(drawn, places, strict=True)]
 
 
 def _place(folder: Path, drawn: Drawn) -> Path:
     if drawn.job is None:
         return folder / f"{drawn.slug}_none.exr"
-    files = (Path(name).read_bytes() for name in (drawn.job["glb"], drawn.job["environment"], WORKER))
+    sources = (drawn.job["glb"], drawn.job["environment"], WORKER, *([MENDED] if drawn.mend else []))
+    files = (Path(name).read_bytes() for name in sources)
     # Rounded: the last digits of a camera follow how the mesh was read and change nothing that can be seen.
-    text = json.dumps(drawn.job | {"camera": np.round(drawn.job["camera"], 5).tolist()} | {"distance": 0})
+    text = json.dumps(drawn.job | {"camera": np.round(drawn.job["camera"], 5).tolist()} | {"distance": 0}) + drawn.mend
     key = hashlib.sha256(text.encode() + b"".join(files)).hexdigest()[:12]
     return folder / f"{drawn.slug}_{key}.exr"
 

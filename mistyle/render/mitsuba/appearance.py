@@ -27,6 +27,7 @@ from mistyle.render.mitsuba import scene as scenery
 PASSED = 32  # most surfaces that a path passes through
 LABELS = ("sampler", "ray", "active", "depth", "passed", "result", "throughput", "before", "pdf", "delta", "valid")
 LEAST_INDEX = 1.001  # Mitsuba rejects a solid with the index of air
+ROUNDING = 1e-4  # of an interpolated opacity: one equal to its cutoff is opaque
 BARE = 0.8  # albedo of a mesh without material, as in Blender
 
 
@@ -173,7 +174,7 @@ def _cut_class(mi: Any) -> type:
             self.nested, self.cutoff = nested, cutoff
 
         def eval_1(self, si, active=True):
-            return dr.select(self.nested.eval_1(si, active) >= self.cutoff, mi.Float(1), mi.Float(0))
+            return dr.select(self.nested.eval_1(si, active) >= self.cutoff - ROUNDING, mi.Float(1), mi.Float(0))
 
         def eval(self, si, active=True):
             return mi.Color3f(self.eval_1(si, active))

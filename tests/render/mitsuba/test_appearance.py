@@ -74,6 +74,14 @@ def test_masks_are_cut_at_their_cutoff(alpha: int, shown: float, tmp_path: Path)
     assert (picture[8, 10, :3] > 0.5).all() == bool(shown)
 
 
+def test_an_opacity_equal_to_its_cutoff_is_opaque(tmp_path: Path) -> None:
+    """Interpolation rounds an even texture by single bits, which must leave no holes."""
+    factor = pbr(baseColorTexture={"index": 0}, baseColorFactor=[1, 1, 1, 0.7])
+    material = {"alphaMode": "MASK", "alphaCutoff": 0.7, "pbrMetallicRoughness": factor}
+    asset = asset_of(tmp_path, material, rgba((255,) * 4, (255,) * 4))
+    assert drawn(asset)[4:12, 4:12, 3].min() == 1
+
+
 def test_opaque_materials_ignore_their_alpha(tmp_path: Path) -> None:
     material = {"pbrMetallicRoughness": pbr(baseColorTexture={"index": 0}, baseColorFactor=[1, 1, 1, 0.2])}
     assert middle(drawn(asset_of(tmp_path, material, rgba((255,) * 3 + (9,), (255,) * 3 + (9,)))))[3] == 1
