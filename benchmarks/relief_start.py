@@ -74,8 +74,7 @@ def main() -> None:
     asset = read_mesh(SCENES / "demo.obj")
     atlas = stylize_start.lay_out(asset, plain, silent)
     layers = painting.paint_layers(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
-    flat = painting.painted(asset, layers, atlas, plain)
-    begun = painting.raised(asset, layers, atlas, plain, flat)
+    flat, begun = painting.raised(asset, layers, atlas, plain)
     targets = views_of(asset, flat, resolution)
     figures: dict[str, float] = {}
     results: dict[str, Any] = {}

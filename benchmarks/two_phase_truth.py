@@ -59,8 +59,7 @@ def painted(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, slop
     from mistyle.stylization.surface.surface_painter import surface_relief
 
     layers = painting.paint_layers(asset, style, atlas, settings, silent)
-    flat = painting.painted(asset, layers, atlas, settings)
-    painter = painting.raised(asset, layers, atlas, settings, flat)
+    flat, painter = painting.raised(asset, layers, atlas, settings)
     truth = []
     for part, (texels, maps) in enumerate(zip(atlas.texels, flat, strict=True)):
         side = painting.texel_side(asset, part, texels)

@@ -245,7 +245,7 @@ def _run(x: torch.Tensor, plan: list[tuple], pad: Callable[[torch.Tensor], torch
     for weight, bias, pool, tap in plan:
         if pool:
             x = functional.max_pool2d(x, 2)
-        x = functional.relu(functional.conv2d(pad(x), weight.to(x), bias.to(x)))
+        x = functional.conv2d(pad(x), weight.to(x), bias.to(x)).relu_()
         if tap:
             maps.append(x)
     return maps

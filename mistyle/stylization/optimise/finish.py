@@ -21,6 +21,7 @@ from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Ambient
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
+from mistyle.process import memory
 from mistyle.stylization.optimise import finish_style
 from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise.finish_settings import JUDGED, FinishSettings
@@ -103,13 +104,14 @@ def finish(
 
     The same inputs, settings, seed and thread count give the same bytes.
     """
-    run = Finishing(painted, features, settings, seed, bridge)
-    before = run.judged()
-    for step in range(settings.steps):
-        run.step(step)
-        progress((step + 1) / settings.steps)
-    run.restrain()
-    return run.result(before, run.judged())
+    with memory.kept():
+        run = Finishing(painted, features, settings, seed, bridge)
+        before = run.judged()
+        for step in range(settings.steps):
+            run.step(step)
+            progress((step + 1) / settings.steps)
+        run.restrain()
+        return run.result(before, run.judged())
 
 
 class Finishing:
@@ -216,7 +218,7 @@ class Finishing:
             cameras.append(frontal(solution.positions[k], *frame, self.pixel, size))
         surface = deferred.trace(self.traced, cameras)
         axes = (np.repeat([c.world_from_cam[:3, k] for c in cameras], size * size, axis=0) for k in (0, 1))
-        places = finish_style.places(self.painting, surface.position, surface.normal, *axes)
+        places = finish_style.places(self.painting, surface.mask, surface.position, surface.normal, *axes)
         counts = weights(surface, cameras) * places.sure
         seen[np.unique(places.sample[counts > 0.5])] += 1
 

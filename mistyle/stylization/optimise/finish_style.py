@@ -5,6 +5,7 @@ the original painting at the same places and rotation. The painting's global sta
 the mean of all colours.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,18 +21,31 @@ TURNED = 35.0  # largest angle in degrees between a piece of the painting and it
 
 
 @dataclass(frozen=True)
+class FeatureLevel:
+    """One level of the painting's features on four quarter turns, one row per pixel (half precision, torch).
+
+    values  (m, k), page after page, row by row        by  pixels of the painting along a pixel of the level
+    starts  first row of each page                     shapes  (rows, columns) of each page
+    """
+
+    values: Any
+    by: int
+    starts: Int[np.ndarray, " 4"]
+    shapes: Int[np.ndarray, "4 2"]
+
+
+@dataclass(frozen=True)
 class PaintingFeatures:
     """The painting's features on four quarter turns (page k is np.rot90(picture, k)).
 
     solution  the painted surface           tree   of its samples, in `lifted` space
     size      (rows, columns) of the unturned painting at the renders' scale
-    pages     per page and level of the features, a map (k, rows, columns), torch
     """
 
     solution: PaintedSurface
     tree: Any
     size: tuple[int, int]
-    pages: tuple[tuple[Any, ...], ...]
+    levels: tuple[FeatureLevel, ...]
 
 
 @dataclass(frozen=True)
@@ -56,19 +70,37 @@ def painting_features(solution: PaintedSurface, pixel: float, features: Features
     for turn in range(4):
         page = torch.from_numpy(np.ascontiguousarray(np.rot90(picture, turn).transpose(2, 0, 1)))[None]
         with torch.no_grad():
-            pages.append(tuple(_thin(maps[0], rows * columns).half() for maps in features(page)))
+            pages.append([_thin(maps[0], rows * columns).half() for maps in features(page)])
     tree = as_points(solution.positions, solution.normals, solution.spacing).tree
-    return PaintingFeatures(solution, tree, (rows, columns), tuple(pages))
+    levels = tuple(_level(maps, columns) for maps in zip(*pages, strict=True))
+    return PaintingFeatures(solution, tree, (rows, columns), levels)
+
+
+def _level(pages: Sequence[Any], columns: int) -> FeatureLevel:
+    """A level from its maps (k, rows, columns) on the four pages."""
+    import torch
+
+    shapes = np.array([maps.shape[1:] for maps in pages])
+    starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:3]])
+    values = torch.cat([maps.permute(1, 2, 0).flatten(0, 1) for maps in pages])
+    return FeatureLevel(values, max(1, round(columns / pages[0].shape[2])), starts, shapes)
 
 
 def places(
     painting: PaintingFeatures,
+    on: Bool[np.ndarray, " n"],
     positions: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     right: Float[np.ndarray, "n 3"],
     down: Float[np.ndarray, "n 3"],
 ) -> Places:
-    """The painting's places at surface points; `right` and `down` are the axes of each point's camera."""
+    """The painting's places at surface points; `right` and `down` are the axes of each point's camera.
+
+    Pixels that are not `on` the surface have no place: not `sure`. The tree is not asked for them, since points far
+    from all samples cost it hundreds of times as much as points among them.
+    """
+    whole, found = len(on), np.flatnonzero(on)
+    positions, normals, right, down = (values[found] for values in (positions, normals, right, down))
     solution = painting.solution
     sample = painting.tree.query(lifted(positions, normals, solution.spacing), workers=workers())[1]
     tangent, turn = solution.tangent[sample], solution.turn[sample]
@@ -88,7 +120,13 @@ def places(
     at = [np.choose(page, [x, y, columns - x, rows - y]), np.choose(page, [y, columns - x, rows - y, x])]
     inside = (x > 0) & (x < columns) & (y > 0) & (y < rows)
     valid = inside & (np.abs(angle - 90 * quarter) < TURNED)
-    return Places(page, np.stack(at, axis=1).astype(np.float32), valid, sample)
+
+    def spread(values: np.ndarray) -> np.ndarray:
+        result = np.zeros((whole, *values.shape[1:]), values.dtype)
+        result[found] = values
+        return result
+
+    return Places(spread(page), spread(np.stack(at, axis=1).astype(np.float32)), spread(valid), spread(sample))
 
 
 def target_features(painting: PaintingFeatures, where: Places, crops: int, size: int) -> list[Any]:
@@ -96,20 +134,16 @@ def target_features(painting: PaintingFeatures, where: Places, crops: int, size:
     import torch
 
     result = []
-    for level in range(len(painting.pages[0])):
-        by = max(1, round(painting.size[1] / painting.pages[0][level].shape[2]))
+    for level in painting.levels:
+        by = level.by
         middle = slice(by // 2, None, by)
         page = where.page.reshape(crops, size, size)[:, middle, middle]
-        at = where.at.reshape(crops, size, size, 2)[:, middle, middle] / by
-        sampled = torch.empty(crops, painting.pages[0][level].shape[0], *page.shape[1:])
-        for turn, pages in enumerate(painting.pages):
-            rows, columns = pages[level].shape[1:]
-            x, y = (np.clip(at[..., axis].astype(np.int64), 0, most - 1) for axis, most in ((0, columns), (1, rows)))
-            chosen = torch.from_numpy(page == turn)
-            values = pages[level].reshape(pages[level].shape[0], -1)
-            flat = torch.from_numpy(y * columns + x)[chosen]
-            sampled.permute(1, 0, 2, 3)[:, chosen] = values[:, flat].float()
-        result.append(sampled)
+        at = (where.at.reshape(crops, size, size, 2)[:, middle, middle] / by).astype(np.int64)
+        rows, columns = level.shapes[page, 0], level.shapes[page, 1]
+        y, x = np.clip(at[..., 1], 0, rows - 1), np.clip(at[..., 0], 0, columns - 1)
+        index = torch.from_numpy(level.starts[page] + y * columns + x)
+        values = level.values.index_select(0, index.flatten()).float()
+        result.append(values.view(*index.shape, -1).permute(0, 3, 1, 2))
     return result
 
 

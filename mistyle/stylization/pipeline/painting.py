@@ -18,6 +18,7 @@ from mistyle.jobs.stages import Run
 from mistyle.process import memory
 from mistyle.stylization.records import Atlas, Baked
 from mistyle.stylization.settings import Settings
+from mistyle.stylization.surface.exemplar.reading import StyleReading
 from mistyle.stylization.surface.guides.guides import Content
 from mistyle.stylization.surface.guides.linefield import DirectionConstraint
 from mistyle.stylization.surface.layers import StyleLayers
@@ -62,13 +63,23 @@ def paint(
     )
 
 
-def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> StyleLayers:
-    """Paint the whole surface once with every picture of the style and slots."""
+def paint_layers(
+    asset: Asset,
+    style: Picture,
+    atlas: Atlas,
+    settings: Settings,
+    report: Report,
+    readings: Sequence[StyleReading] = (),
+) -> StyleLayers:
+    """Paint the whole surface once with every picture of the style and slots.
+
+    `readings` are the measures of these pictures, if known; others are measured here.
+    """
     from mistyle.deliver.colour import read_style
+    from mistyle.stylization.surface.exemplar.chosen import resolved
     from mistyle.stylization.surface.layers import content, masked_style, painted_direction, scaled, slot_masks
 
     surface = scaled(settings.surface, asset, settings.paint.stroke_size)
-    settings = settings.model_copy(update={"surface": surface})
     paths, masks = slot_masks(asset, atlas.texels, settings.paint.slots)
     pictures = [masked_style(style, settings.paint.style_mask), *(read_style(path, settings.colour) for path in paths)]
     choice = [np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels]
@@ -83,7 +94,8 @@ def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings,
         def part_done(done: float, k: int = k) -> None:
             report((k + done) / len(pictures))
 
-        solutions.append(paint(asset, picture, settings, part_done, lightness, direction))
+        own = settings.model_copy(update={"surface": resolved(surface, readings[k]) if readings else surface})
+        solutions.append(paint(asset, picture, own, part_done, lightness, direction))
     return StyleLayers(tuple(solutions), tuple(choice))
 
 
@@ -99,8 +111,8 @@ def bake(
     """Section 4.1.4 for a painted surface: texels sample the painting directly; views give visibility only."""
     from mistyle.atlas.bake import accepted
 
-    maps, seen = painted(asset, layers, atlas, settings), []
-    with_relief = raised(asset, layers, atlas, settings, maps)
+    maps, with_relief = raised(asset, layers, atlas, settings)
+    seen = []
     for part, texels in enumerate(atlas.texels):
         seen.append(accepted(views, texels, settings.bake, mesh=asset.mesh)[1].reshape(texels.covered.shape))
         report((part + 1) / len(atlas.texels))
@@ -119,55 +131,62 @@ def painted(asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, se
 
     A single solution covers all texture sets.
     """
-    from mistyle.atlas.texels import pad_in_place, sharpen_in_place
-    from mistyle.stylization.surface.layers import painted_mask, protected
-    from mistyle.stylization.surface.surface_painter import surface_colour
-
-    maps = []
-    for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-        side, albedo = texel_side(asset, part, texels), memory.zeros(start.albedo.shape)
-        for solution, at in whose(layers, part, texels):
-            for rows in pieces(at):
-                mask = at[rows]
-                place = texels.position[rows][mask], texels.normal[rows][mask]
-                albedo[rows][mask] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
-        sharpen_in_place(albedo, texels)
-        pad_in_place([albedo], texels, settings.atlas.padding)
-        painted_maps = replace(start, albedo=albedo, known=texels.covered)
-        if settings.paint.protect is not None:
-            painted_maps = protected(painted_maps, start, painted_mask(settings.paint.protect, texels))
-        maps.append(painted_maps)
-    return maps
+    return [_laid(asset, layers, atlas, settings, part, (0, 0))[0] for part in range(len(atlas.texels))]
 
 
 def raised(
-    asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings, maps: Sequence[Maps]
-) -> list[Maps]:
-    """Painted maps with the painting's relief added to their normals and its gloss to their roughness."""
-    from mistyle.core.image import nearest_fill_in_place
-    from mistyle.stylization.surface.layers import PaintRelief, TexelBand, lay_relief, painted_mask, protected
-    from mistyle.stylization.surface.surface_painter import surface_relief
-
+    asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings
+) -> tuple[list[Maps], list[Maps]]:
+    """The painted maps, and the same with the painting's relief added to their normals and its gloss to their
+    roughness."""
     height = HEIGHT if settings.paint.height is None else settings.paint.height
     gloss = GLOSS if settings.paint.gloss is None else settings.paint.gloss
-    if height == gloss == 0:
-        return list(maps)
-    result = []
-    for part, (texels, flat) in enumerate(zip(atlas.texels, maps, strict=True)):
-        side, tangents = texel_side(asset, part, texels), corner_tangents(asset.mesh)
-        bent = replace(flat, normal=memory.copied(flat.normal), roughness=memory.copied(flat.roughness))
-        for solution, at in whose(layers, part, texels):
-            for rows in pieces(at):
-                mask = at[rows]
-                place = texels.position[rows][mask], texels.normal[rows][mask]
-                relief = PaintRelief(*surface_relief(solution, *place, footprint=side))
-                lay_relief(bent, TexelBand(texels, rows, mask), relief, height, gloss, asset.mesh, tangents)
-        chosen = [values for values, used in ((bent.normal, height), (bent.roughness, gloss)) if used > 0]
+    both = [_laid(asset, layers, atlas, settings, part, (height, gloss)) for part in range(len(atlas.texels))]
+    return [flat for flat, _ in both], [bent for _, bent in both]
+
+
+def _laid(
+    asset: Asset,
+    layers: StyleLayers | PaintedSurface,
+    atlas: Atlas,
+    settings: Settings,
+    part: int,
+    strength: tuple[float, float],
+) -> tuple[Maps, Maps]:
+    """Painted maps of a texture set without and with relief and gloss of this strength; equal if both are 0.
+
+    Colour and relief share the search for nearest samples, band by band.
+    """
+    from mistyle.atlas.texels import pad_in_place, sharpen_in_place
+    from mistyle.core.image import nearest_fill_in_place
+    from mistyle.stylization.surface.layers import PaintRelief, TexelBand, lay_relief, painted_mask, protected
+    from mistyle.stylization.surface.lookup import neighbours
+    from mistyle.stylization.surface.surface_painter import surface_colour, surface_relief
+
+    texels, start, used = atlas.texels[part], atlas.start[part], any(strength)
+    side, tangents = texel_side(asset, part, texels), corner_tangents(asset.mesh)
+    albedo, bent = memory.zeros(start.albedo.shape), start
+    if used:
+        bent = replace(start, normal=memory.copied(start.normal), roughness=memory.copied(start.roughness))
+    for solution, at in whose(layers, part, texels):
+        for rows in pieces(at):
+            mask = at[rows]
+            place = texels.position[rows][mask], texels.normal[rows][mask]
+            near = neighbours(solution, *place)
+            albedo[rows][mask] = linear_from_srgb(surface_colour(solution, *place, footprint=side, near=near))
+            if used:
+                relief = PaintRelief(*surface_relief(solution, *place, footprint=side, near=near))
+                lay_relief(bent, TexelBand(texels, rows, mask), relief, *strength, asset.mesh, tangents)
+    sharpen_in_place(albedo, texels)
+    pad_in_place([albedo], texels, settings.atlas.padding)
+    flat, bent = (replace(maps, albedo=albedo, known=texels.covered) for maps in (start, bent))
+    chosen = [values for values, share in zip((bent.normal, bent.roughness), strength, strict=True) if share > 0]
+    if used:
         nearest_fill_in_place(chosen, texels.covered)
-        if settings.paint.protect is not None:
-            bent = protected(bent, flat, painted_mask(settings.paint.protect, texels))
-        result.append(bent)
-    return result
+    if settings.paint.protect is not None:
+        kept = painted_mask(settings.paint.protect, texels)
+        flat, bent = (protected(maps, start, kept) for maps in (flat, bent))
+    return flat, bent
 
 
 def pieces(at: np.ndarray) -> Iterator[slice]:
@@ -185,11 +204,13 @@ def whose(layers: StyleLayers | PaintedSurface, part: int, texels: Texels) -> li
     return [(one, texels.covered & (layers.choice[part] == k)) for k, one in enumerate(layers.solutions)]
 
 
-def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> StyleLayers:
-    """The stage "surface": the painting, before it is baked."""
+def surface_stage(
+    run: Run, asset: Asset, style: Picture, atlas: Atlas, readings: Sequence[StyleReading] = ()
+) -> StyleLayers:
+    """The stage "surface": the painting, before it is baked. `readings` are the measures of the style's pictures."""
     s, seed = run.job.settings, run.job.settings.seed
     inputs = [style.rgb, style.alpha, s.surface, s.paint, paint_files(s.paint), seed]
-    return run.record("surface", ["texels"], inputs, lambda r: paint_layers(asset, style, atlas, s, r))
+    return run.record("surface", ["texels"], inputs, lambda r: paint_layers(asset, style, atlas, s, r, readings))
 
 
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], after: str) -> list[View]:

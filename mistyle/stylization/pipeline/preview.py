@@ -23,7 +23,7 @@ from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import mesh_stage, start_engines
 from mistyle.stylization.pipeline.budget import PLAIN, STYLED, TILED, counts
 from mistyle.stylization.pipeline.job import PREVIEW_STAGES, Job
-from mistyle.stylization.pipeline.painting import check_paint, paint_layers, painted, raised, surface_stage
+from mistyle.stylization.pipeline.painting import check_paint, paint_layers, raised, surface_stage
 from mistyle.stylization.pipeline.start import lay_out, texels_stage
 from mistyle.stylization.records import Atlas
 from mistyle.stylization.settings import Settings
@@ -64,7 +64,7 @@ def preview(job: Job, progress: Progress) -> dict[str, Any]:
             after = ["surface"]
 
             def maps_of(report: Report) -> list[Maps]:
-                return raised(asset, layers, atlas, s, painted(asset, layers, atlas, s))
+                return raised(asset, layers, atlas, s)[1]
         else:
             progress.note(sentence(s, small))
 
@@ -99,7 +99,7 @@ def sentence(full: Settings, small: Settings) -> str:
 def painted_maps(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> list[Maps]:
     """Paint the surface and bake it with its relief, uncached."""
     layers = paint_layers(asset, style, atlas, settings, report)
-    return raised(asset, layers, atlas, settings, painted(asset, layers, atlas, settings))
+    return raised(asset, layers, atlas, settings)[1]
 
 
 def write(path: Path, asset: Asset, maps: Sequence[Maps], seed: int) -> None:

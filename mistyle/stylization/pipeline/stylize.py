@@ -125,7 +125,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     atlas = texels_stage(run, asset)
     views = views_stage(run, asset, atlas)
     looks = style_looks(style, run.job.style.name, s, run.progress)
-    baked, stylized, finishing = painted_stages(run, asset, style, atlas, views)
+    baked, stylized, finishing = painted_stages(run, asset, style, atlas, views, looks)
     painted = ["bake", "stylized"]
     if "stylized" in run.edited:
         baked, stylized = retouched_stage(run, asset, atlas, baked, stylized)
@@ -213,7 +213,7 @@ def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any)
 
 
 def painted_stages(
-    run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
+    run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View], looks: Sequence[StyleLook]
 ) -> tuple[Baked, list[View], FinishRecord | None]:
     """The stages 'surface', 'bake', 'finish' (if enabled) and 'stylized': the painted texture and its views."""
     s = run.job.settings
@@ -223,7 +223,7 @@ def painted_stages(
         swept = swept_stages(run, asset, style, atlas, views)
         write_first(run, asset, atlas, swept[0])
         return *swept, None
-    layers = surface_stage(run, asset, style, atlas)
+    layers = surface_stage(run, asset, style, atlas, [look.reading for look in looks])
     baked = run.record(
         "bake", ["views", "surface"], [s.bake, s.refined, s.paint], lambda r: bake(asset, layers, atlas, views, s, r)
     )

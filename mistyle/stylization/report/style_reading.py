@@ -67,8 +67,8 @@ def measures(reading: StyleReading) -> str:
     grid = "x".join(str(side) for side in reading.pixel_grid)
     return (
         f"unit {reading.unit:.2f} of the long side (clarity {reading.clarity:.2f}), lines {reading.line_likeness:.2f}, "
-        f"flat {reading.flatness:.2f}, rectilinear {reading.rectilinear:.2f}, tones {reading.tones}"
-        + ("" if reading.pixel_grid == (0, 0) else f", art pixels of {grid}")
+        f"flat {reading.flatness:.2f}, rectilinear {reading.rectilinear:.2f}, tiled {reading.tiled:.2f}, "
+        f"tones {reading.tones}" + ("" if reading.pixel_grid == (0, 0) else f", art pixels of {grid}")
     )
 
 

@@ -68,6 +68,14 @@ class Canvas:
     width: Any
 
 
+@dataclass(frozen=True)
+class Neighbours:
+    """The nearest samples of n surface points and their weights, for look-ups of several pictures."""
+
+    index: Int[np.ndarray, "n k"]
+    weight: Float[np.ndarray, "n k"]
+
+
 def painted_surface(
     level: Level, field: NearestNeighbourField, size: tuple[int, int], painting: Float[np.ndarray, "h w 3"]
 ) -> PaintedSurface:
@@ -101,8 +109,9 @@ def colour(
     *,
     footprint: float = 0.0,
     device: str = "llvm",
+    near: Neighbours | None = None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Encoded sRGB (0..1) at surface points with unit normals.
+    """Encoded sRGB (0..1) at surface points with unit normals; `near` is `neighbours` of them, if known.
 
     The three samples nearest in [p, 3 h n] each continue their piece of the painting to the point; their colours are
     blended by exp(-(d^2 - d0^2) / (2 (0.25 h)^2)). `footprint` is the distance between neighbouring queries (a texel, a
@@ -111,10 +120,12 @@ def colour(
     """
     glazed = bool(surface.glaze.any())
     out = np.empty((len(positions), 3), np.float32)
-    for part, shown, index, weight in looked_up(surface, positions, normals, surface.painting, footprint, device):
+    near = near or neighbours(surface, positions, normals)
+    for part, shown in looked_up(surface, positions, near, surface.painting, footprint, device):
         values = np.clip(shown[:, :3], 0, 1)
         if glazed:
-            values = style.lightened(values, (surface.glaze[index] * weight).sum(axis=1, dtype=np.float32))
+            glaze = surface.glaze[near.index[part]] * near.weight[part]
+            values = style.lightened(values, glaze.sum(axis=1, dtype=np.float32))
         out[part] = values
     return out
 
@@ -126,31 +137,49 @@ def relief(
     *,
     footprint: float = 0.0,
     device: str = "llvm",
+    near: Neighbours | None = None,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """The gradient of the painted height along the surface (world vectors, root mean square about 1), and the
-    painting's offset of the roughness. A height h tilts the unit normal n to the direction of n - grad h."""
+    painting's offset of the roughness. A height h tilts the unit normal n to the direction of n - grad h. `near` as in
+    `colour`."""
     own = reliefs.relief(surface.painting)
     picture = np.concatenate([own.slope, own.dull[..., None]], axis=2)
     gradient, dull = np.empty((len(positions), 3), np.float32), np.empty(len(positions), np.float32)
-    for part, values, _, _ in looked_up(surface, positions, normals, picture, footprint, device, slopes=True):
+    near = near or neighbours(surface, positions, normals)
+    for part, values in looked_up(surface, positions, near, picture, footprint, device, slopes=True):
         gradient[part], dull[part] = values[:, :3], values[:, 3]
     return gradient, dull
+
+
+def neighbours(
+    surface: PaintedSurface, positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]
+) -> Neighbours:
+    """The samples near surface points with unit normals, as `blended` selects and weights them."""
+    tree = as_points(surface.positions, surface.normals, surface.spacing).tree
+    count = min(AROUND, len(surface.positions))
+    keep = min(NEAREST, count)
+    index, weight = np.empty((len(positions), keep), np.int64), np.empty((len(positions), keep))
+    for low in range(0, len(positions), CHUNK):
+        part = slice(low, low + CHUNK)
+        asked = lifted(positions[part], normals[part], surface.spacing)
+        distance, found = tree.query(asked, k=np.arange(1, count + 1), workers=workers())
+        index[part], weight[part] = blended(distance / surface.spacing, found, surface.piece, surface.crisp)
+    return Neighbours(index, weight)
 
 
 def looked_up(
     surface: PaintedSurface,
     positions: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
+    near: Neighbours,
     picture: Float[np.ndarray, "h w 3"],
     footprint: float,
     device: str,
     *,
     slopes: bool = False,
-) -> Iterator[tuple[slice, Float[np.ndarray, "m 4"], Int[np.ndarray, "m k"], Float[np.ndarray, "m k"]]]:
-    """Samples of a picture of the painting's size at surface points, in chunks: points, values, nearest samples and
-    their weights. With `slopes`, the first two channels are a vector along the picture's x and y."""
+) -> Iterator[tuple[slice, Float[np.ndarray, "m 4"]]]:
+    """Samples of a picture of the painting's size at surface points, in chunks: points and values. With `slopes`, the
+    first two channels are a vector along the picture's x and y."""
     dj = kernels.module(device)
-    tree = as_points(surface.positions, surface.normals, surface.spacing).tree
     pixel = surface.spacing / max(surface.scale)  # one pixel of the painting on the surface
     if footprint > pixel:
         picture = style.blurred(picture, 0.4 * footprint / pixel)
@@ -159,11 +188,9 @@ def looked_up(
     canvas = on_canvas(dj, surface, picture)
     whole_pixels = surface.whole_pixels and footprint <= pixel
     for low in range(0, len(positions), CHUNK):
-        p, n = positions[low : low + CHUNK], normals[low : low + CHUNK]
-        count = min(AROUND, len(surface.positions))
-        distance, index = tree.query(lifted(p, n, surface.spacing), k=np.arange(1, count + 1), workers=workers())
-        index, weight = blended(distance / surface.spacing, index, surface.piece, surface.crisp)
-        yield slice(low, low + len(p)), paint(dj, canvas, p, index, weight, slopes, whole_pixels), index, weight
+        part = slice(low, min(low + CHUNK, len(positions)))
+        index, weight = near.index[part], near.weight[part]
+        yield part, paint(dj, canvas, positions[part], index, weight, slopes, whole_pixels)
 
 
 def blended(

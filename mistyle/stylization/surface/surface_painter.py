@@ -9,7 +9,7 @@ from mistyle.core.asset import Picture
 from mistyle.core.mesh import Mesh
 from mistyle.stylization.surface.guides.guides import Content, Occlusion
 from mistyle.stylization.surface.guides.linefield import DirectionConstraint
-from mistyle.stylization.surface.lookup import PaintedSurface
+from mistyle.stylization.surface.lookup import Neighbours, PaintedSurface
 from mistyle.stylization.surface.settings import ResolvedSettings, SurfaceSettings
 
 
@@ -54,11 +54,12 @@ def surface_colour(
     positions: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     footprint: float = 0.0,
+    near: Neighbours | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """Encoded sRGB of surface points; `footprint` (working units): query spacing, over which colour is averaged."""
     from mistyle.stylization.surface.lookup import colour
 
-    return colour(surface, positions, normals, footprint=footprint, device=array_module())
+    return colour(surface, positions, normals, footprint=footprint, device=array_module(), near=near)
 
 
 def surface_relief(
@@ -66,9 +67,10 @@ def surface_relief(
     positions: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     footprint: float = 0.0,
+    near: Neighbours | None = None,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Gradient of the painted height along the surface (root mean square about 1) and offset of the roughness;
     `footprint` as in `surface_colour`."""
     from mistyle.stylization.surface.lookup import relief
 
-    return relief(surface, positions, normals, footprint=footprint, device=array_module())
+    return relief(surface, positions, normals, footprint=footprint, device=array_module(), near=near)

@@ -47,6 +47,14 @@ def tiles(period, size=512):
     return np.repeat(np.where(joint, 0.15, tone)[..., None], 3, axis=2).astype(np.float32)
 
 
+def bent(period, wave=0.35, size=512):
+    """The tiles with rows that rise and sink by `wave` of their length, with grain."""
+    y, x = np.mgrid[:size, :size].astype(np.float32)
+    shift = wave * size / (2 * np.pi) * np.sin(2 * np.pi * x / size)
+    picture = cv2.remap(tiles(period, 2 * size), x, (y + shift + size / 4).astype(np.float32), cv2.INTER_LINEAR)
+    return np.clip(picture + 0.02 * np.random.default_rng(1).normal(size=picture.shape), 0, 1).astype(np.float32)
+
+
 def stripes(angle, period=17.0, size=400):
     """Waves whose crests run along `angle` degrees, counter-clockwise from the x axis."""
     y, x = np.mgrid[:size, :size]
@@ -82,6 +90,17 @@ def test_other_pictures_have_no_grid(picture):
     assert edges.pixel_grid(picture) == (0, 0)
     compressed = cv2.imencode(".jpg", (255 * picture).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 60])[1]
     assert edges.pixel_grid((cv2.imdecode(compressed, 1) / 255).astype(np.float32)) == (0, 0)
+
+
+@pytest.mark.parametrize("picture", [bent(16), bent(24), 1 - bent(24), tiles(16), style.resized(bent(24), (384, 384))])
+def test_tiles_are_closed_cells_of_one_size_even_where_rows_bend(picture):
+    reading = read_style(picture)
+    assert reading.tiled > 0.3 and graphic(reading) == 1
+
+
+@pytest.mark.parametrize("picture", [noise(), noise(blur=0.7), oil(), shapes(), stripes(30), stripes(0, period=9.0)])
+def test_strokes_and_shapes_are_no_tiles(picture):
+    assert read_style(picture).tiled < 0.12
 
 
 @pytest.mark.parametrize("period", [16, 32, 64])

@@ -12,6 +12,7 @@ FEW_TONES = 2
 LINED = (0.6, 0.75)  # line-likeness at which its term of `graphic` is 0 and 1
 RIGHT_ANGLED = (0.1, 0.3)  # the same for `rectilinear`
 CLEAR = (0.25, 0.5)  # the same for the clarity of its unit
+TILED = (0.12, 0.3)  # the same for `tiled`
 GRAPHIC = 0.5  # value of `graphic` from which pieces are cut
 LARGE_UNIT = 0.2  # in long sides: a unit too large for five levels
 COHERENCE = (0.08, 0.1)  # brushwork, graphic
@@ -27,11 +28,12 @@ def flat(reading: StyleReading) -> float:
 
 
 def graphic(reading: StyleReading) -> float:
-    """Graphic structure 0..1 of a painting: flat areas, lines, right angles, a clear unit."""
+    """Graphic structure 0..1 of a painting: flat areas, lines, right angles, tiles, a clear unit."""
     lined = np.interp(reading.line_likeness, LINED, (0, 1))
     square = np.interp(reading.rectilinear, RIGHT_ANGLED, (0, 1))
     clear = np.interp(reading.clarity, CLEAR, (0, 1))
-    return float(max(flat(reading), lined, square, clear))
+    tiles = np.interp(reading.tiled, TILED, (0, 1))
+    return float(max(flat(reading), lined, square, tiles, clear))
 
 
 def from_painting(reading: StyleReading) -> dict[str, object]:

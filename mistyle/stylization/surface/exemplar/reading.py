@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mistyle.stylization.surface.exemplar import edges
 from mistyle.stylization.surface.exemplar import exemplar as style
@@ -31,6 +31,14 @@ PERIODIC = 0.12  # least rise of the autocorrelation from its first dip to a per
 ANGLES = 36
 STANDS_OUT = 1.6  # times the mean of the histogram of directions
 AXIS_WIDTH = 10.0  # degrees on both sides of an axis
+TILE_LONG = 1024  # pixels along the longer side for tiles: their joints are thin
+JOINTS = (9, 15)  # pixels: joints are narrower than this
+JOINT_AREA = 8  # times that width: side of the window whose mean is the usual strength of a line
+JOINT_LEVELS = (0.8, 1.2)  # times that mean: pixels above it are joints
+LEAST_TILE, LARGEST_TILE = 20, 1 / 200  # pixels, and share of the picture
+COMPACT = 0.4  # least area of a tile over the square of its longer extent
+EVEN_TILES = 3.0  # tiles differ from the median area by this factor at most
+FEWEST_TILES = 30
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,7 @@ class StyleReading:
     pixel_grid    sides (down, across) of one art pixel in picture pixels; 0 where it is not pixel art
     directions    dominant directions of lines, degrees counter-clockwise from the picture's x axis, 0..180
     rectilinear   share of the contrast along two axes at right angles
+    tiled         share of the area between thin lines that lies in closed, compact cells of one size
     border        border outside the picture (top, left, bottom, right), shares of the height or width
 
     Lettering, cartouches and signatures are not detected: `paint.style_mask` excludes them.
@@ -58,6 +67,7 @@ class StyleReading:
     pixel_grid: tuple[int, int]
     directions: tuple[float, ...]
     rectilinear: float
+    tiled: float
     border: style.Crop
 
 
@@ -75,7 +85,7 @@ def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] 
         if min(grid) > 1
         else inner
     )
-    size = style.long_side(art.shape, min(LONG, max(art.shape[:2])))
+    size, finer = (style.long_side(art.shape, min(most, max(art.shape[:2]))) for most in (LONG, TILE_LONG))
     lab = style.lab_from_srgb(style.resized(art, size))
     unit, clarity = structural_unit(lab)
     lines, directions, rectilinear = line_reading(lab[..., 0])
@@ -88,6 +98,7 @@ def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] 
         pixel_grid=grid,
         directions=directions,
         rectilinear=rectilinear,
+        tiled=tiled(style.lab_from_srgb(style.resized(art, finer))[..., 0]),
         border=border,
     )
 
@@ -204,3 +215,34 @@ def line_reading(lightness: Float[np.ndarray, "h w"]) -> tuple[float, tuple[floa
     pair = float((both + np.roll(both, -90)).max())
     even = 2 * (2 * width + 1) / 180
     return lines, tuple(float(p) + 0.5 for p in peaks), float(np.clip((pair - even) / (1 - even), 0, 1))
+
+
+def tiled(lightness: Float[np.ndarray, "h w"]) -> float:
+    """Share (0..1) of the area between thin lines that lies in closed, compact cells of one size: tiles in joints.
+
+    Lines, dark or light, are top-hats of the lightness above their local mean; cells are the connected components of
+    the rest. Rows may bend: nothing here depends on directions. The largest share over widths, signs and levels counts.
+    Brushwork has 0.04 at most, since its lines end and its cells join; noise of one scale has 0.11, mosaics and leaded
+    glass have 0.13 to 0.65. Tiles above LARGEST_TILE do not count.
+    """
+    calm, best = style.blurred(lightness, FINE), 0.0
+    for width in JOINTS:
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width))
+        for kind in (cv2.MORPH_BLACKHAT, cv2.MORPH_TOPHAT):
+            hat = cv2.morphologyEx(calm, kind, disc, borderType=cv2.BORDER_REPLICATE)
+            usual = cv2.blur(hat, (JOINT_AREA * width, JOINT_AREA * width)) + 1e-3
+            best = max(best, *(even_cells(hat < level * usual) for level in JOINT_LEVELS))
+    return best
+
+
+def even_cells(inside: Bool[np.ndarray, "h w"]) -> float:
+    """Share of a mask's area in compact connected components whose area is near the median of such components."""
+    found = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=4)[2][1:]
+    area, extent = found[:, cv2.CC_STAT_AREA].astype(np.float64), found[:, 2:4].max(axis=1).astype(np.float64)
+    tile = (area >= LEAST_TILE) & (area < LARGEST_TILE * inside.size) & (area > COMPACT * extent**2)
+    if tile.sum() < FEWEST_TILES:
+        return 0.0
+    sizes = np.sort(area[tile])
+    middle = sizes[np.searchsorted(np.cumsum(sizes), sizes.sum() / 2)]
+    even = tile & (area > middle / EVEN_TILES) & (area < middle * EVEN_TILES)
+    return float(area[even].sum() / area.sum())
