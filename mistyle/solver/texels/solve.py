@@ -142,7 +142,7 @@ def solve_texels(
     )  # fmt: skip
 
     def solved_anew(done: Callable[[float], None]) -> Solution:
-        return recover_solve.first_solve(problem, (first, mean), observed.seen, settings, done)
+        return recover_solve.first_solve(problem, (first, mean), observed, atlas, settings, done)
 
     solution, observed, direct = _rounds(context, renderer, problem, solved_anew, observed, progress)
     bad = ~np.isfinite(solution.values).all(axis=1, keepdims=True)
