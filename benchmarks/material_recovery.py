@@ -7,8 +7,9 @@ rendered, at which resolution and with which texels: `recovery_truth.py`, `recov
 metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, ("_paper") the paper's own rig with its
 lights together, ("_soft", no rivals) 16 views x an environment map in 3 positions, and ("_unknown", no rivals) 16 views
 under one that stands still and is solved for too. Texel figures are over the surface that at least three cameras see,
-weighted by area; "confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference,
-cameras between theirs, mean over the pictures.
+weighted by area; "confident_" ones over the 95 % of it that the fit trusts most; "within_" ones are the share of it
+whose error is within the fit's own standard deviation. Relit: four lights of no reference, cameras between theirs, mean
+over the pictures.
 
 `figures` are ours. `baselines`: "constant" is the best map of one value; "other_seed" is the truth, relit with other
 random numbers than all others share: what two noisy renders of equal maps differ by; "together" is ours from the same
@@ -29,7 +30,7 @@ import numpy as np
 
 from benchmarks import recovery_pictures as drawing
 from benchmarks import recovery_report as report
-from benchmarks.material_metrics import best_constant, confident, map_errors, mean_errors, relight_errors
+from benchmarks.material_metrics import best_constant, calibration, confident, map_errors, mean_errors, relight_errors
 from benchmarks.recovery_ours import ours
 from benchmarks.recovery_pictures import Shot
 from benchmarks.recovery_rivals import LOOPS, naive, write_job
@@ -183,6 +184,7 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     judge = Judge(known, weights, options)
     fitted = ours(known, main_shots, main_pictures, frame, unknown=row.kind == "unknown", **chosen)
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
+    methods["ours"] |= calibration(known.maps, fitted.maps, fitted.spread, weights)
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
     methods["other_seed"] = judge.differences(judge.relit(known.maps, frame, seed=2))
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}

@@ -176,7 +176,7 @@ def best_by_region(
     classes = [[(s, np.where(_is_metal(s.values) == m, extra, NEVER)) for s, extra in solved] for m in CLASSES]
     (dielectric, as_dielectric), (metal, as_metal) = map(best, classes)
     evidence = as_dielectric - as_metal
-    chosen = metal_regions(evidence, apparent_albedo(problem, observed), observed, atlas)
+    chosen = metal_regions(evidence, apparent_albedo(problem, observed), observed.texel, atlas)
     return chosen_of(chosen, metal, dielectric)
 
 
