@@ -31,7 +31,7 @@ def labels(evidence: np.ndarray, apparent: np.ndarray) -> np.ndarray:
 def test_a_highlight_decides_its_region() -> None:
     """Few texels with evidence on either side, none elsewhere, and another colour from the middle."""
     evidence, apparent = np.zeros((8, 32)), np.zeros((8, 32))
-    evidence[3:5, 3:6], evidence[3:5, 25:28], apparent[:, 14:] = 60, -60, 0.4
+    evidence[3:5, 3:6], evidence[3:5, 18:21], apparent[:, 14:] = 60, -60, 0.4
     expected = np.zeros((8, 32), bool)
     expected[:, :14] = True
     assert (labels(evidence, apparent) == expected).all()
