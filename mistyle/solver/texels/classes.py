@@ -19,7 +19,7 @@ from mistyle.solver.texels.levenberg_marquardt import Problem
 from mistyle.solver.texels.observations import TexelObservations
 
 JOIN = 40.0  # cost of a pair of like neighbours with different labels
-DARK, RELATIVE = 0.001, 0.5  # difference of apparent albedos at which that cost halves: absolute, and relative
+DARK, RELATIVE = 0.002, 1.0  # difference of apparent albedos from which that cost is 0: absolute, and relative
 STRONG = 60.0  # bound of a texel's own evidence: errors of the model are not independent
 SWEEPS = 60
 HOT = 4.0  # first temperature; it falls to 1
@@ -66,7 +66,7 @@ def _pairs(atlas: Atlas, alike: Float[np.ndarray, "a 3"]) -> Sequence[tuple[np.n
 
 def _likeness(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     apart = (a - b) / (DARK + RELATIVE * (a + b) / 2)
-    return 1 / (1 + (apart**2).mean(axis=1))
+    return np.maximum(1 - (apart**2).mean(axis=1), 0)
 
 
 def apparent_albedo(problem: Problem, observed: TexelObservations) -> Float[np.ndarray, "t 3"]:
