@@ -308,5 +308,3 @@ def _least_squares(matrix: np.ndarray, rhs: np.ndarray, near: Radiance) -> Radia
             wrong = wrong[-1:]  # Murty's rule: one exchange at a time ends in any case
         free[wrong] = ~free[wrong]
     return np.maximum(x, 0).reshape(3, -1).T
-
-

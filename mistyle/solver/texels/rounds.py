@@ -9,6 +9,7 @@ unreliable and the observation's weight falls.
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -26,6 +27,7 @@ from mistyle.solver.prior import (
     shrink_normals,
     unconstrained_std,
 )
+from mistyle.solver.schedule import RESTARTS
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import OVER_SEAMS, Atlas, Values, neighbourhood, scatter, with_seam_weights
 from mistyle.solver.texels.levenberg_marquardt import Problem, Solution
@@ -33,7 +35,20 @@ from mistyle.solver.texels.observations import TexelObservations, sample_image, 
 
 STARTS = (0.08, 0.25, 0.7)  # roughness has local minima
 UNLIKE = 0.3  # share of the correction that is added to an observation's standard deviation
-RESTARTS = 3  # rounds in which texels also start from their neighbours' values
+
+Keep = Callable[[str, Callable[[], Solution]], Solution]
+
+
+def _unkept(name: str, solve: Callable[[], Solution]) -> Solution:
+    """A `Keep` without a journal."""
+    return solve()
+
+
+class Round(NamedTuple):
+    """The number of a round, and `keep`, which computes a solution or takes it from a journal by its name."""
+
+    number: int
+    keep: Keep = _unkept
 
 
 def first_solve(
@@ -42,6 +57,7 @@ def first_solve(
     seen: Int[np.ndarray, " t"],
     settings: RecoverSettings,
     progress: Callable[[float], None],
+    keep: Keep = _unkept,
 ) -> Solution:
     """The best of several starts: `begin`'s first, and every roughness of a coarse grid, as dielectric and as metal.
 
@@ -62,7 +78,8 @@ def first_solve(
     solved = []
     for k, (each, around, weight) in enumerate(tries):
         done = lambda share, k=k: progress((k + share) / len(tries))  # noqa: E731
-        solution = problem.solve(each, around, weight, settings.solver_iterations, done)
+        arguments = each, around, weight, settings.solver_iterations, done
+        solution = keep(f"start{k}", lambda given=arguments: problem.solve(*given))
         extra = log_prior_penalty(solution.values, seen) if settings.metallic else 0
         solved.append((solution, penalty(solution.values, around, weight) + extra))
     return best(solved)
@@ -75,7 +92,7 @@ def another_round(
     solution: Solution,
     residuals: Callable[[int], np.ndarray],
     settings: RecoverSettings,
-    number: int,
+    current: Round,
 ) -> Solution:
     """Solve again for targets corrected by `residuals(k)`, reference minus render of picture k for `solution`.
     `observed` holds the references and their weights.
@@ -99,17 +116,17 @@ def another_round(
     mean, prior = shrink_normals(solution, mean, prior, observed, atlas)
 
     def tried(start: Values, steps: int, metal: Float[np.ndarray, " t"]) -> tuple[Solution, Float[np.ndarray, " t"]]:
+        name = f"try{len(solved)}"
         if not settings.metallic:
-            solved = problem.solve(start, mean, prior, steps)
-            return solved, penalty(solved.values, mean, prior)
+            one = current.keep(name, lambda: problem.solve(start, mean, prior, steps))
+            return one, penalty(one.values, mean, prior)
         around, weight, constant = combine_class_prior(mean, prior, metal)
-        solved = problem.solve(start, around, weight, steps)
-        return solved, penalty(solved.values, around, weight) + constant + log_prior_penalty(
-            solved.values, observed.seen
-        )
+        one = current.keep(name, lambda: problem.solve(start, around, weight, steps))
+        return one, penalty(one.values, around, weight) + constant + log_prior_penalty(one.values, observed.seen)
 
-    solved = [tried(solution.values, 5, _is_metal(solution.values))]
-    if number < RESTARTS:
+    solved: list[tuple[Solution, np.ndarray]] = []
+    solved.append(tried(solution.values, 5, _is_metal(solution.values)))
+    if current.number < RESTARTS:
         for roughness in (None, 0.15, 0.4, 0.8):
             guess = mean.copy()
             if roughness is not None:
