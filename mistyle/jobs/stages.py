@@ -140,6 +140,11 @@ class Run(Generic[JobT]):
         with self.progress.stage(f"first {name}", what) as report:
             self.visible.put(name, key, lambda folder: write(folder, report), about=about)
 
+    def preliminary(self, name: str, key: str, write: Callable[[Path], object], about: Mapping[str, Any]) -> None:
+        """`early` within a running stage, without a progress line of its own."""
+        self._set_edits_aside(self.visible, name)
+        self.visible.put(name, key, write, about=about)
+
     def absorb(self, name: str, write: Callable[[Path, Report], object], about: Mapping[str, Any] = NOTHING) -> Path:
         """Write a reused stage again with its folder's edits, which then belong to its result."""
         keeper, edited = self.visible, self.edited[name]

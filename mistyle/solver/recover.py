@@ -18,19 +18,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.stage_progress import StageProgress
 from mistyle.process import stopping
+from mistyle.render.deferred.image_samples import window
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.fit_state import FitState, arrays_of, state_from
 from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pictures.descend import picture_pass, settled
-from mistyle.solver.schedule import Pass, Size, schedule, shares, size_from
+from mistyle.solver.schedule import FILLED, Pass, Size, schedule, shares, size_from
 from mistyle.solver.settings import RecoverSettings, descent_steps
 from mistyle.solver.smoothing import map_smoothing
 from mistyle.solver.table import atlas_of, linked
@@ -108,11 +110,12 @@ class Reached:
 @dataclass(frozen=True)
 class Limits:
     """When a recovery ends: after so many `passes`, 0 for all, or with the first pass that would exceed `deadline`, a
-    value of `time.monotonic`. `watch` is called after each pass."""
+    value of `time.monotonic`. `watch` is called after each pass, `resumed` with the share that a checkpoint holds."""
 
     passes: int = 0
     deadline: float = float("inf")
     watch: Callable[[Reached], None] = lambda reached: None
+    resumed: Callable[[float], None] = lambda share: None
 
 
 NO_LIMITS = Limits()
@@ -188,6 +191,8 @@ class _Work:
         done = shares(settings, planned, size_of(context))
         if journal.resumed is not None:
             state = self._resumed(limits.passes or len(planned)) or state
+        if state.done:
+            limits.resumed(done[state.done])
         if solved and not state.done:
             solved = self.level(self.progress.part(0, done[0])).problem is not None
         elif state.estimate is not None:
@@ -304,7 +309,14 @@ def size_of(context: FitContext) -> Size:
     settings, cameras = context.settings, context.captures.cameras
     covered, soft = sum(int(c.sum()) for c in context.atlas.covered), has_soft(context.captures.lights)
     pixels = [camera.size[0] * camera.size[1] for camera in cameras]
-    return size_from(settings, pixels, covered, soft)
+    return size_from(settings, pixels, covered, soft, shown_in(context.traced.mesh, cameras))
+
+
+def shown_in(mesh: Mesh, cameras: Sequence[Camera]) -> float:
+    """Approximate share of the pictures that shows the mesh: FILLED of its bounding boxes."""
+    boxes = [window(mesh, camera) for camera in cameras]
+    box = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in boxes)
+    return FILLED * box / sum(camera.size[0] * camera.size[1] for camera in cameras)
 
 
 def polished(context: FitContext, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable:

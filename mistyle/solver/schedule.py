@@ -23,13 +23,16 @@ SOFT_COST = 64  # approximate run time of a texel under a sky, relative to one l
 SKY_CELLS = 128
 MOST = 512  # pixels along the longer side of an estimate of indirect light
 SHOWN, SEEN = 0.3, 0.35  # the object's share of a picture, and the share of its covered texels that a picture sees
+FILLED = 0.55  # the object's share of its bounding box in a picture, or of a picture without alpha or mask
+JUDGES = 48  # pictures whose loss accepts or rejects the steps on whole pictures
 RESTARTS = 3  # rounds in which texels also start from their neighbours' values
 
 # Seconds of two cores, per unit named; those of soft light are of one of its cells.
-PER_OBSERVATION, PER_CELL = 4e-8, 8e-9  # a texel in a picture, in one step of the per-texel solver
-PER_SAMPLE, PER_SAMPLE_CELL = 6e-8, 1.2e-8  # a sample of a pixel, rendered
-GRADIENT = 2.5  # a step's cost over that of a picture
-PER_VISIBILITY = 3.5e-8  # a sample and a cell, once
+PER_OBSERVATION, PER_CELL = 2.5e-8, 3.5e-9  # a texel in a picture, in one step of the per-texel solver
+PER_SAMPLE, PER_SAMPLE_CELL = 2e-8, 1.5e-9  # a sample of a pixel, rendered
+PER_COLLECTED = 4e-7  # a sample of a pixel, collected once
+GRADIENT = 2.9  # a step's cost over that of a picture
+PER_VISIBILITY = 1.3e-8  # a sample and a cell, once
 PER_PATH, PER_SOFT_PATH = 1.2e-7, 3e-7  # a path of indirect light
 PER_SMOOTHED = 1.5e-5  # a covered texel in one smoothing pass
 PER_JOINT = 3e-6  # a sample in a joint step
@@ -86,9 +89,11 @@ def schedule(settings: RecoverSettings, pictures: int, solved: bool) -> list[Pas
     return [*result, *([Pass("polish", 0, settings.polish)] if settings.polish else [])]
 
 
-def size_from(settings: RecoverSettings, pixels: Sequence[int], covered: float, soft: bool) -> Size:
-    """Counts of a fit to pictures of so many pixels and an atlas with `covered` texels, for an object that fills SHOWN
-    of each picture and of which one picture sees SEEN."""
+def size_from(
+    settings: RecoverSettings, pixels: Sequence[int], covered: float, soft: bool, shown: float = SHOWN
+) -> Size:
+    """Counts of a fit to pictures of so many pixels and an atlas with `covered` texels, for an object that fills the
+    share `shown` of each picture and of which one picture sees SEEN."""
     solved = covered
     while solved > settings.solver_texels / (SOFT_COST if soft else 1):
         solved /= 4
@@ -97,7 +102,7 @@ def size_from(settings: RecoverSettings, pixels: Sequence[int], covered: float, 
         len(pixels),
         covered,
         SEEN * solved * len(pixels),
-        SHOWN * sum(pixels) * subsamples,
+        shown * sum(pixels) * subsamples,
         sum(min(n, MOST**2) for n in pixels),
         SKY_CELLS if soft else 0,
     )
@@ -105,12 +110,31 @@ def size_from(settings: RecoverSettings, pixels: Sequence[int], covered: float, 
 
 def collecting_seconds(settings: RecoverSettings, size: Size) -> float:
     """Seconds before the first pass: observations, and the samples of the pictures."""
-    return size.samples * (4 * PER_SAMPLE + settings.soft_cells * PER_VISIBILITY * (size.cells > 0)) + 2
+    return size.samples * (PER_COLLECTED + settings.soft_cells * PER_VISIBILITY * (size.cells > 0)) + 2
+
+
+def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool, shown: float = SHOWN) -> float:
+    """Seconds of rendering every picture once, with all cells of soft light."""
+    cells = SKY_CELLS * (PER_SAMPLE_CELL + PER_VISIBILITY) if soft else 0
+    subsamples = settings.soft_subsamples if soft else settings.subsamples
+    return shown * sum(pixels) * subsamples * (PER_COLLECTED + cells)
+
+
+def finishing_seconds(settings: RecoverSettings, size: Size) -> float:
+    """Seconds after the last pass: the loss before and after, smoothing, and the residual of every picture."""
+    judged = min(1.0, JUDGES / size.pictures) if descent_steps(settings) else 0
+    smoothing = settings.smooth * size.texels * PER_SMOOTHED
+    return (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + smoothing
+
+
+def _rendering(settings: RecoverSettings, size: Size) -> float:
+    """Seconds of rendering every picture from collected samples."""
+    return size.samples * (PER_SAMPLE_CELL * (settings.soft_cells + 16) if size.cells else PER_SAMPLE)
 
 
 def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     """Approximate seconds of a pass."""
-    render = size.samples * (PER_SAMPLE_CELL * (settings.soft_cells + 16) if size.cells else PER_SAMPLE)
+    render = _rendering(settings, size)
     step = size.observations * (PER_CELL * size.cells if size.cells else PER_OBSERVATION)
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
     total = one.samples * size.paths * (PER_SOFT_PATH if size.cells else PER_PATH) + (render if one.samples else 0)

@@ -19,7 +19,7 @@ from mistyle.solver.context import FitContext
 from mistyle.solver.fit_state import FitState
 from mistyle.solver.journal import Journal
 from mistyle.solver.prior import NOTHING
-from mistyle.solver.schedule import Pass
+from mistyle.solver.schedule import JUDGES, Pass
 from mistyle.solver.settings import RecoverSettings, passes
 from mistyle.solver.smoothing import map_smoothing
 from mistyle.solver.table import Atlas, fill
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
     from mistyle.solver.pictures.adam import Descent
 
-JUDGES = 48  # pictures whose loss accepts or rejects the steps
 SEEDS = 7907  # seed offset between two estimates; exceeds the number of rounds
 # Factors of the rate by channel after the per-texel solver: albedo is nearly right already, and longer steps would
 # follow the pictures' noise, ...
