@@ -57,7 +57,8 @@ def state_from(arrays: Arrays, context: FitContext) -> FitState:
     solution = Solution(**records["solution"]) if records["solution"] else None
     estimate = None
     if records["estimate"]:
-        estimate = TexelEstimate(**records["estimate"] | {"solved": bool(records["estimate"]["solved"])})
+        solved = bool(records["estimate"].pop("solved"))
+        estimate = TexelEstimate(**records["estimate"], solved=solved)
     own = {name: words[name] for name in ("done", "settled", "over")}
     return FitState(direct, solution=solution, estimate=estimate, table=arrays.get("table"), **own)
 

@@ -22,6 +22,7 @@ from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.io.store.atomic import digest
 from mistyle.jobs import checkpoint
 from mistyle.jobs.memory_budget import size_of, with_setting
+from mistyle.jobs.progress import StageReport
 from mistyle.jobs.run_record import merged_peaks, merged_seconds, write_record
 from mistyle.jobs.stages import Run
 
@@ -46,7 +47,7 @@ def recovered_maps(run: Run, asset: Asset, texels: Sequence[Texels], captures: C
     return recovered
 
 
-def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, key: str, report: Report) -> Any:
+def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, key: str, report: StageReport) -> Any:
     """The fit, with checkpoints in work/ under `key`, so that another job's checkpoint is never resumed."""
     from mistyle.atlas.texels import start_maps
     from mistyle.solver.recover import Checkpoints, Limits, Reached, recover, shown_in

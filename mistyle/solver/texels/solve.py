@@ -127,11 +127,12 @@ def _level(
 
 def first_solution(level: TexelLevel, journal: Journal, progress: Callable[[float], None]) -> Solution:
     """The texels solved from the start."""
-    assert level.problem is not None
+    problem = level.problem
+    assert problem is not None
 
     def solve() -> dict[str, np.ndarray]:
         keep = kept_in(journal, "solve")
-        arguments = level.problem, level.start, level.observed.seen, level.context.settings, progress
+        arguments = problem, level.start, level.observed.seen, level.context.settings, progress
         return dict(vars(recover_solve.first_solve(*arguments, keep)))
 
     return Solution(**journal.part("solve", solve))
@@ -319,7 +320,7 @@ def journalled_light(
 ) -> Iterator[tuple[int, Radiance, None]]:
     """`estimate_indirect`, each picture's light a part of the journal."""
     known = journal.named("light.")
-    done = {"skip": {int(name.split(".")[1]) for name in known}} if known else {}
+    done: dict[str, Any] = {"skip": {int(name.split(".")[1]) for name in known}} if known else {}
     for name in known:
         yield int(name.split(".")[1]), journal.part(name, dict)["light"], None
     for k, light, _ in estimate_indirect(context, renderer, table, sampling, progress, **done):
