@@ -126,11 +126,12 @@ def _bar(what: str) -> Iterator[StageReport]:
         task, shown = bars.add_task(what, total=1.0, left=""), [0.0]
 
         def show(done: float, left: Callable[[], float | None]) -> None:
-            now, fields = time.perf_counter(), {}
+            now = time.perf_counter()
             if now - shown[0] >= 1:
                 shown[0], seconds = now, left()
-                fields = {} if seconds is None else {"left": f"{int(seconds // 60)}:{int(seconds % 60):02d} left"}
-            bars.update(task, completed=min(max(done, 0.0), 1.0), **fields)
+                text = "" if seconds is None else f"{int(seconds // 60)}:{int(seconds % 60):02d} left"
+                bars.update(task, left=text)
+            bars.update(task, completed=min(max(done, 0.0), 1.0))
 
         yield StageReport(show)
 
