@@ -19,7 +19,7 @@ from mistyle.solver.settings import (
 
 Kind = Literal["solve", "rounds", "pictures", "joint", "polish"]
 STARTS, RESTARTED, CONTINUED = 3, 37, 5  # starts of a solve; steps of a round with restarts, and of one without
-SOFT_COST = 64  # approximate run time of a texel under a sky, relative to one light
+SOFT_COST = 16  # approximate run time of a texel under a sky, relative to one light
 SKY_CELLS = 128
 MOST = 512  # pixels along the longer side of an estimate of indirect light
 SHOWN, SEEN = 0.3, 0.35  # the object's share of a picture, and the share of its covered texels that a picture sees
@@ -54,9 +54,9 @@ class Pass:
 class Size:
     """Counts that the seconds are proportional to.
 
-    texels        covered texels of the atlas, and those that are `solved`
+    texels        covered texels of the atlas
     observations  of the solved texels in all pictures
-    samples       rendered samples of all pictures
+    samples       rendered samples of all pictures; `rough`: those in rounds of the per-texel solver
     paths         pixels of all estimates of indirect light
     cells         of soft light, 0 without
     """
@@ -65,6 +65,7 @@ class Size:
     texels: float
     observations: float
     samples: float
+    rough: float
     paths: float
     cells: int
 
@@ -98,11 +99,13 @@ def size_from(
     while solved > settings.solver_texels / (SOFT_COST if soft else 1):
         solved /= 4
     subsamples = settings.soft_subsamples if soft else settings.subsamples
+    area = shown * sum(pixels)
     return Size(
         len(pixels),
         covered,
         SEEN * solved * len(pixels),
-        shown * sum(pixels) * subsamples,
+        area * subsamples,
+        area * (1 if soft and solved < covered else subsamples),
         sum(min(n, MOST**2) for n in pixels),
         SKY_CELLS if soft else 0,
     )
@@ -110,7 +113,8 @@ def size_from(
 
 def collecting_seconds(settings: RecoverSettings, size: Size) -> float:
     """Seconds before the first pass: observations, and the samples of the pictures."""
-    return size.samples * (PER_COLLECTED + settings.soft_cells * PER_VISIBILITY * (size.cells > 0)) + 2
+    samples = size.samples + (size.rough if size.rough < size.samples else 0)
+    return samples * (PER_COLLECTED + settings.soft_cells * PER_VISIBILITY * (size.cells > 0)) + 2
 
 
 def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool, shown: float = SHOWN) -> float:
@@ -135,6 +139,8 @@ def _rendering(settings: RecoverSettings, size: Size) -> float:
 def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     """Approximate seconds of a pass."""
     render = _rendering(settings, size)
+    if one.kind in ("solve", "rounds"):
+        render *= size.rough / size.samples
     step = size.observations * (PER_CELL * size.cells if size.cells else PER_OBSERVATION)
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
     total = one.samples * size.paths * (PER_SOFT_PATH if size.cells else PER_PATH) + (render if one.samples else 0)

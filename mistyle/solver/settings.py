@@ -36,7 +36,7 @@ class RecoverSettings(BaseModel):
     solver_texels: int = Field(
         default=2_000_000,
         ge=1,
-        description="most texels of the per-texel solver, under soft light a 64th of it; a finer atlas is solved at a "
+        description="most texels of the per-texel solver, under soft light a 16th of it; a finer atlas is solved at a "
         "coarser level",
     )
     solver_iterations: int = Field(default=12, ge=1, le=1000, description="Levenberg-Marquardt steps from each start")

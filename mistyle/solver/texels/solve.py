@@ -95,7 +95,9 @@ def texel_level(
         start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
     note = f"The per-texel solver ran on a level {by} times coarser than the atlas."
     context.notes.extend([note] * (note not in context.notes))
-    return _level(coarse, coarse.renderer(), by, start, progress)
+    # Its texels are larger than pixels, and samples under soft light are slow.
+    subsamples = 1 if has_soft(context.captures.lights) else None
+    return _level(coarse, coarse.renderer(subsamples), by, start, progress)
 
 
 def _level(
