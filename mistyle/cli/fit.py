@@ -76,7 +76,9 @@ def add_fit(verbs: Any) -> None:
     )
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; rerun to resume")
     verb.add_argument("--dry-run", action="store_true", help="print estimated time, memory and disk, and stop")
-    add_job_options(verb, ("draft", "standard"), "draft: a texture of 512² and a ninth of the steps; standard (default): 1024²")
+    add_job_options(
+        verb, ("draft", "standard"), "draft: a texture of 512² and a ninth of the steps; standard (default): 1024²"
+    )
     add_memory_option(verb)
     add_mesh_options(verb)
     _add_reference_options(verb)

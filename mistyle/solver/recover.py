@@ -28,9 +28,9 @@ from mistyle.process import stopping
 from mistyle.render.deferred.image_samples import window
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.fit_state import FitState, arrays_of, state_from
 from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
+from mistyle.solver.pass_state import PassState, arrays_of, state_from
 from mistyle.solver.pictures.descend import picture_pass, settled
 from mistyle.solver.schedule import FILLED, Pass, Size, schedule, shares, size_from
 from mistyle.solver.settings import RecoverSettings, descent_steps
@@ -98,7 +98,7 @@ class Reached:
     done: int
     planned: int
     work: "_Work"
-    state: FitState
+    state: PassState
 
     def maps(self, smooth: bool = True) -> tuple[Maps, ...]:
         """The maps so far; those of passes on whole pictures are not smoothed, and none without `smooth`, to be
@@ -180,13 +180,13 @@ class _Work:
         self._renderer: MaterialRenderer | None = None
         self._joint: JointSetup | None = None
         self._targets: DirectCaptures | None = None
-        self._estimates: tuple[FitState, TexelEstimate] | None = None
+        self._estimates: tuple[PassState, TexelEstimate] | None = None
 
-    def run(self, limits: Limits) -> tuple[FitState, int]:
+    def run(self, limits: Limits) -> tuple[PassState, int]:
         """The state after the last pass within the limits, and the number of planned passes."""
         context, journal = self.context, self.journal
         settings, pictures = context.settings, len(context.captures)
-        state, solved = FitState(DirectCaptures(context.captures)), settings.solver != "pictures"
+        state, solved = PassState(DirectCaptures(context.captures)), settings.solver != "pictures"
         planned = schedule(settings, pictures, solved)
         done = shares(settings, planned, size_of(context))
         if journal.resumed is not None:
@@ -217,7 +217,7 @@ class _Work:
             journal.save()
         return state, len(planned)
 
-    def result(self, state: FitState) -> tuple[MaterialTable, TexelEstimate]:
+    def result(self, state: PassState) -> tuple[MaterialTable, TexelEstimate]:
         """The final table of a state, smoothed, and the texels' estimate."""
         estimate, settings = self.estimate(state), self.context.settings
         if state.table is None:
@@ -227,7 +227,7 @@ class _Work:
         assert state.table is not None
         return state.table, estimate
 
-    def estimate(self, state: FitState, smooth: bool = True) -> TexelEstimate:
+    def estimate(self, state: PassState, smooth: bool = True) -> TexelEstimate:
         """The texels' estimate of a state."""
         if state.estimate is not None:
             return state.estimate
@@ -249,7 +249,7 @@ class _Work:
             self._level = texel_level(self.context, lambda: self.renderer(None), self.start, progress)
         return self._level
 
-    def renderer(self, state: FitState | None) -> "MaterialRenderer":
+    def renderer(self, state: PassState | None) -> "MaterialRenderer":
         """The renderer of the whole atlas, with the references of a state."""
         if self._renderer is None:
             self._renderer, self._targets = (
@@ -261,7 +261,7 @@ class _Work:
             self._targets = state.direct
         return self._renderer
 
-    def _resumed(self, passes: int) -> FitState | None:
+    def _resumed(self, passes: int) -> PassState | None:
         """The state of the checkpoint, unless it is beyond the last pass."""
         assert self.journal.resumed is not None
         state = state_from(self.journal.resumed, self.context)
@@ -270,7 +270,7 @@ class _Work:
         self.journal.earlier = {}
         return None
 
-    def _after(self, state: FitState, one: Pass, progress: StageProgress) -> FitState:
+    def _after(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:
         """The state after a pass."""
         context, journal = self.context, self.journal
         if one.kind == "solve":
@@ -292,7 +292,7 @@ class _Work:
         table = self.result(state)[0]
         return replace(state, table=polished(context, table, progress), settled=True)
 
-    def _joint_pass(self, state: FitState, one: Pass, progress: StageProgress) -> FitState:
+    def _joint_pass(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:
         if self._joint is None:
             # This renderer has finer pictures; the samples of the other one are freed first.
             self._renderer = None

@@ -1,6 +1,6 @@
 """The outputs of `mistyle fit` for other programs: the asset, and a Mitsuba scene of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,15 @@ def write(
     folder: Path,
     job: Any,
     asset: Asset,
-    texels: Sequence[Texels],
-    maps: Sequence[Maps],
+    sets: Iterable[tuple[Texels, Maps]],
     report: Report = lambda done: None,
     edited: Edited = UNEDITED,
-    *,
     state: str = "",
 ) -> None:
-    """Write the asset; `edited` holds textures that a person painted over, `state` is the share of passes done where
-    some are missing."""
+    """Write the asset of texture `sets`; `edited` holds textures that a person painted over, `state` is the share of
+    passes done where some are missing."""
     provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
     provenance |= {"state": state} if state else {}
-    sets = zip(texels, maps, strict=True)
     asset_files.write(folder, job, asset, sets, provenance, report, edited, own=BORDER)
 
 

@@ -121,9 +121,8 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
         complete = recovered.passes == recovered.planned
         state = "" if complete else f"{recovered.passes} of {recovered.planned} passes"
-        folder, edited = asset_stage(
-            run, ["recover"], lambda f, e, r: write(f, job, asset, texels, recovered.maps, r, e, state=state)
-        )
+        sets = list(zip(texels, recovered.maps, strict=True))
+        folder, edited = asset_stage(run, ["recover"], lambda f, e, r: write(f, job, asset, sets, r, e, state))
         tell_edits(run)
         maps = edited(part_stems(job.name, asset.mesh.parts), recovered.maps)[0]
         recovered = replace(recovered, maps=tuple(maps))

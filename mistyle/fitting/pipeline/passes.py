@@ -17,7 +17,7 @@ from mistyle.core.light import has_soft
 from mistyle.core.maps import Texels
 from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import write
-from mistyle.fitting.pipeline.plan import closing_seconds
+from mistyle.fitting.pipeline.times import closing_seconds
 from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.io.store.atomic import digest
 from mistyle.jobs import checkpoint
@@ -103,7 +103,7 @@ def write_preliminary(
     place = job.out / "asset" / f"{job.name}.glb"
 
     def fill(folder: Path) -> None:
-        write(folder, job, asset, texels, maps, state=state)
+        write(folder, job, asset, zip(texels, maps, strict=True), state=state)
 
     run.preliminary("asset", digest([key, "passes", done]), fill, {"passes": done, "planned": planned})
     record = {

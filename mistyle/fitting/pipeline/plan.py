@@ -1,10 +1,8 @@
 """Estimates of `--dry-run` for a fit to pictures; see jobs/plan.py."""
 
-from collections.abc import Sequence
 from typing import Any
 
 from mistyle.core.light import has_soft
-from mistyle.core.maps import Texels
 from mistyle.fitting.pipeline.budget import (
     COVERED,
     MATERIAL,
@@ -14,11 +12,11 @@ from mistyle.fitting.pipeline.budget import (
     material_gb,
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.fitting.pipeline.times import closing_stages, recover_seconds
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
     PER_READ_PIXEL,
-    PER_SAMPLE_RAY,
     PER_TEXEL,
     costs,
     extent_of,
@@ -29,18 +27,10 @@ from mistyle.jobs.stages import claim_run
 from mistyle.solver.schedule import (
     FILLED,
     SHOWN,
-    collecting_seconds,
-    finishing_seconds,
-    picture_seconds,
-    schedule,
-    seconds,
-    size_from,
 )
-from mistyle.solver.settings import RecoverSettings, joint_steps
 
 LIGHT_SECONDS = 25  # of an unknown light, of few observations whatever the pictures
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
-PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
 
 
 def plan_material(job: Any) -> dict[str, Any]:
@@ -90,36 +80,6 @@ def masked(job: Any) -> bool:
 
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
     return any(shot.mask is not None or shot.alpha_of is not None for shot in shots)
-
-
-def recover_seconds(settings: Any, pixels: Sequence[int], covered: float, soft: bool, shown: float) -> float:
-    """Seconds of the passes within `--passes`, and of what precedes and follows them."""
-    chosen: RecoverSettings = settings.recover
-    chosen = chosen.model_copy(update={"joint": 0 if soft else joint_steps(chosen)})
-    size = size_from(chosen, pixels, covered, soft, shown)
-    ordered = schedule(chosen, len(pixels), chosen.solver != "pictures")
-    total = collecting_seconds(chosen, size) + finishing_seconds(chosen, size)
-    return total + sum(seconds(chosen, one, size) for one in ordered[: settings.passes or len(ordered)])
-
-
-def closing_stages(settings: Any, pixels: Sequence[int], texels: float, soft: bool, shown: float) -> dict[str, float]:
-    """Seconds of the stages after "recover"."""
-    report, drawn = settings.report, {"none": 0.0, "page": 0.3, "full": 1.0}[settings.report.detail]
-    return {
-        "measure": 1 + picture_seconds(settings.recover, pixels, soft, shown),
-        "asset": 1 + 4 * texels * PER_TEXEL,
-        "scene": 0.5 + texels * PER_SCENE_TEXEL,
-        "report": drawn * (5 + report.frames * report.resolution**2 * report.spp * PER_SAMPLE_RAY),
-    }
-
-
-def closing_seconds(settings: Any, pixels: Sequence[int], texels: Sequence[Texels], soft: bool, shown: float) -> float:
-    """Seconds between the last pass and the end of a job, on its own threads."""
-    count = sum(t.covered.size for t in texels)
-    covered = sum(int(t.covered.sum()) for t in texels)
-    finishing = finishing_seconds(settings.recover, size_from(settings.recover, pixels, covered, soft, shown))
-    total = finishing + sum(closing_stages(settings, pixels, count, soft, shown).values())
-    return total * 2 / thread_count(settings)
 
 
 def _limited(settings: Any, stages: dict[str, float]) -> dict[str, float]:

@@ -32,7 +32,6 @@ from mistyle.core.light import has_soft
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, TILT_X, TILT_Y, MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.fit_state import FitState
 from mistyle.solver.joint.algebra import LinearisedImage, Unknowns, diagonal_blocks, normal_matvec, pcg, rhs
 from mistyle.solver.joint.pixels import (
     ImageFootprint,
@@ -43,6 +42,7 @@ from mistyle.solver.joint.pixels import (
     unknown_frames,
 )
 from mistyle.solver.journal import Journal
+from mistyle.solver.pass_state import PassState
 from mistyle.solver.prior import MARGIN, NOTHING
 from mistyle.solver.schedule import Pass
 from mistyle.solver.settings import RecoverSettings, joint_steps
@@ -131,8 +131,8 @@ def joint_setup(context: FitContext, renderer: "MaterialRenderer") -> JointSetup
 
 
 def joint_pass(
-    context: FitContext, setup: JointSetup, state: FitState, one: Pass, journal: Journal, progress: StageProgress
-) -> FitState:
+    context: FitContext, setup: JointSetup, state: PassState, one: Pass, journal: Journal, progress: StageProgress
+) -> PassState:
     """`settings.joint` steps from the state's table after a new estimate of indirect light.
 
     Steps that worsen the fit are undone, and no joint pass follows.

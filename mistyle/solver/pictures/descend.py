@@ -16,8 +16,8 @@ from mistyle.core.maps import place_of
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import COLUMNS, SOLVED, TILT, MaterialTable
 from mistyle.solver.context import FitContext
-from mistyle.solver.fit_state import FitState
 from mistyle.solver.journal import Journal
+from mistyle.solver.pass_state import PassState
 from mistyle.solver.prior import NOTHING
 from mistyle.solver.schedule import JUDGES, Pass
 from mistyle.solver.settings import RecoverSettings, passes
@@ -47,11 +47,11 @@ DAMPING = 0.3
 def picture_pass(
     context: FitContext,
     renderer: "MaterialRenderer",
-    state: FitState,
+    state: PassState,
     one: Pass,
     journal: Journal,
     progress: StageProgress,
-) -> FitState:
+) -> PassState:
     """The state after a pass on whole pictures. `renderer` has the references of `state.direct`; those of an estimate
     of indirect light before the pass replace them."""
     estimate, direct = state.estimate, state.direct
@@ -67,7 +67,7 @@ def picture_pass(
     return replace(state, table=table, direct=direct)
 
 
-def settled(context: FitContext, renderer: "MaterialRenderer", state: FitState) -> FitState:
+def settled(context: FitContext, renderer: "MaterialRenderer", state: PassState) -> PassState:
     """The state after the last pass on whole pictures, smoothed; the texels' estimate, with a note, if the loss did not
     fall."""
     estimate = state.estimate
@@ -82,7 +82,7 @@ def settled(context: FitContext, renderer: "MaterialRenderer", state: FitState) 
     return replace(state, table=smoothed(context, state), settled=True)
 
 
-def smoothed(context: FitContext, state: FitState) -> MaterialTable:
+def smoothed(context: FitContext, state: PassState) -> MaterialTable:
     """The table of a state between passes on whole pictures, smoothed where the texels were solved."""
     estimate, settings = state.estimate, context.settings
     assert estimate is not None and state.table is not None

@@ -44,7 +44,7 @@ def _unkept(name: str, solve: Callable[[], Solution]) -> Solution:
     return solve()
 
 
-class Round(NamedTuple):
+class SolverRound(NamedTuple):
     """The number of a round, and `keep`, which computes a solution or takes it from a journal by its name."""
 
     number: int
@@ -92,7 +92,7 @@ def another_round(
     solution: Solution,
     residuals: Callable[[int], np.ndarray],
     settings: RecoverSettings,
-    current: Round,
+    current: SolverRound,
 ) -> Solution:
     """Solve again for targets corrected by `residuals(k)`, reference minus render of picture k for `solution`.
     `observed` holds the references and their weights.

@@ -171,7 +171,7 @@ def solution_after_rounds(
         def solve(solution=solution, number=number, name=name) -> dict[str, np.ndarray]:
             table = scatter_to_atlas(solution.values, level.observed, atlas)
             residuals = RoundResiduals(direct, level.renderer, level.renderer.upload(table), [], journal)
-            current = recover_solve.Round(number, kept_in(journal, name))
+            current = recover_solve.SolverRound(number, kept_in(journal, name))
             solved = recover_solve.another_round(
                 problem, observed, atlas, solution, residuals, context.settings, current
             )

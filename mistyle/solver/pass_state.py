@@ -12,7 +12,7 @@ from mistyle.solver.texels.solve import TexelEstimate
 
 
 @dataclass(frozen=True)
-class FitState:
+class PassState:
     """After `done` passes.
 
     direct    the references without their estimated indirect light
@@ -31,7 +31,7 @@ class FitState:
     over: bool = False
 
 
-def arrays_of(state: FitState, context: FitContext) -> Arrays:
+def arrays_of(state: PassState, context: FitContext) -> Arrays:
     """The arrays from which `state_from` restores the state, with notes and trace of the context."""
     words = {name: getattr(state, name) for name in ("done", "settled", "over")}
     flat: Arrays = {"words": text_array(words | {"notes": context.notes, "trace": context.trace})}
@@ -43,7 +43,7 @@ def arrays_of(state: FitState, context: FitContext) -> Arrays:
     return flat if state.table is None else flat | {"table": state.table}
 
 
-def state_from(arrays: Arrays, context: FitContext) -> FitState:
+def state_from(arrays: Arrays, context: FitContext) -> PassState:
     """The state of `arrays_of`; notes and trace return into the context."""
     words = text_value(arrays["words"])
     context.notes[:] = words["notes"]
@@ -60,7 +60,7 @@ def state_from(arrays: Arrays, context: FitContext) -> FitState:
         solved = bool(records["estimate"].pop("solved"))
         estimate = TexelEstimate(**records["estimate"], solved=solved)
     own = {name: words[name] for name in ("done", "settled", "over")}
-    return FitState(direct, solution=solution, estimate=estimate, table=arrays.get("table"), **own)
+    return PassState(direct, solution=solution, estimate=estimate, table=arrays.get("table"), **own)
 
 
 def _inside(arrays: Arrays, prefix: str) -> dict[str, np.ndarray]:
