@@ -9,6 +9,7 @@ unreliable and the observation's weight falls.
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,6 +27,7 @@ from mistyle.solver.prior import (
     shrink_normals,
     unconstrained_std,
 )
+from mistyle.solver.schedule import CLASS_ROUNDS, RESTARTS
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import OVER_SEAMS, PRIOR_MEAN, Atlas, Values, neighbourhood, scatter, with_seam_weights
 from mistyle.solver.texels.classes import apparent_albedo, metal_regions
@@ -37,10 +39,22 @@ CLASSES = (0.0, 1.0)  # metallic of dielectrics and metals
 LEAST_SHARE = 0.02  # of a class around a texel: below it, its neighbours give no prior as that class
 NEVER = 1e9  # cost of a solution of the other class
 UNLIKE = 0.3  # share of the correction that is added to an observation's standard deviation
-RESTARTS = 3  # rounds in which texels also start from their neighbours' values
-CLASS_ROUNDS = 2  # of them, in which a texel's class may change
 
 Candidate = tuple[Solution, Float[np.ndarray, " t"]]  # a solution, and its cost beyond the observations'
+Keep = Callable[[str, Callable[[], Solution]], Solution]
+
+
+def _unkept(name: str, solve: Callable[[], Solution]) -> Solution:
+    """A `Keep` without a journal."""
+    return solve()
+
+
+class SolverRound(NamedTuple):
+    """`since`, the number of a round as `schedule.rounds_since` counts it, and `keep`, which computes a solution or
+    takes it from a journal by its name."""
+
+    since: int
+    keep: Keep = _unkept
 
 
 def first_solve(
@@ -50,6 +64,7 @@ def first_solve(
     atlas: Atlas,
     settings: RecoverSettings,
     progress: Callable[[float], None],
+    keep: Keep = _unkept,
 ) -> Solution:
     """The best of several starts: `begin`'s first, and every roughness of a coarse grid, as dielectric and as metal.
 
@@ -69,7 +84,8 @@ def first_solve(
     solved = []
     for k, (each, around, weight) in enumerate(tries):
         done = lambda share, k=k: progress((k + share) / len(tries))  # noqa: E731
-        solution = problem.solve(each, around, weight, settings.solver_iterations, done)
+        arguments = each, around, weight, settings.solver_iterations, done
+        solution = keep(f"start{k}", lambda given=arguments: problem.solve(*given))
         extra = log_prior_penalty(solution.values, observed.seen) if settings.metallic else 0
         solved.append((solution, penalty(solution.values, around, weight) + extra))
     return best_by_region(problem, solved, observed, atlas) if settings.metallic else best(solved)[0]
@@ -82,7 +98,7 @@ def another_round(
     solution: Solution,
     residuals: Callable[[int], np.ndarray],
     settings: RecoverSettings,
-    number: int,
+    current: SolverRound,
 ) -> Solution:
     """Solve again for targets corrected by `residuals(k)`, reference minus render of picture k for `solution`.
     `observed` holds the references and their weights.
@@ -106,22 +122,23 @@ def another_round(
     mean, prior = shrink_normals(solution, mean, prior, observed, atlas)
 
     near, kept = (mean, prior), None
-    if settings.metallic and number < CLASS_ROUNDS:
+    if settings.metallic and current.since < CLASS_ROUNDS:
         candidates = []
         for metal in CLASSES:
             around = _class_neighbours(solution, near, metal, observed, atlas)
             own = np.where((_is_metal(solution.values) == metal)[:, None], solution.values, around[0])
             labels = np.full(len(own), metal, np.float32)
-            candidates += _tries(problem, own, around, labels, observed, True)
+            keep = lambda name, solve, metal=metal: current.keep(f"{name}_class{metal:.0f}", solve)  # noqa: E731
+            candidates += _tries((problem, keep), own, around, labels, observed, True)
         return best_by_region(problem, candidates, observed, atlas)
     if settings.metallic:
         kept = _is_metal(solution.values)
-    restart = number < RESTARTS and not settings.metallic
-    return best(_tries(problem, solution.values, near, kept, observed, restart))[0]
+    restart = current.since < RESTARTS and not settings.metallic
+    return best(_tries((problem, current.keep), solution.values, near, kept, observed, restart))[0]
 
 
 def _tries(
-    problem: Problem,
+    solver: tuple[Problem, Keep],
     own: Values,
     near: tuple[Values, Values],
     metal: Float[np.ndarray, " t"] | None,
@@ -140,9 +157,10 @@ def _tries(
             guess[:, ROUGHNESS] = roughness
         starts.append((guess, 8))
     around, weight, constant = (*near, 0) if metal is None else combine_class_prior(*near, metal)
+    problem, keep = solver
     solved = []
-    for start, steps in starts:
-        solution = problem.solve(start, around, weight, steps)
+    for k, (start, steps) in enumerate(starts):
+        solution = keep(f"try{k}", lambda begin=start, steps=steps: problem.solve(begin, around, weight, steps))
         extra = penalty(solution.values, around, weight) + constant
         if metal is not None:
             extra = extra + log_prior_penalty(solution.values, observed.seen)
