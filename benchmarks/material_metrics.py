@@ -5,7 +5,7 @@ Texel figures are weighted means over an atlas: a texel's weight is the surface 
 linear radiance and are over the object's pixels. Higher is better for PSNR and SSIM, lower for all others.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -92,6 +92,32 @@ def angles(truth: Float[np.ndarray, "*n 3"], fitted: Float[np.ndarray, "*n 3"]) 
     """Degrees between unit vectors, exact for small angles too: 2 atan2(|a - b|, |a + b|)."""
     a, b = truth.astype(np.float64), fitted.astype(np.float64)
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
+
+
+def calibration(
+    truth: Sequence[Maps],
+    fitted: Sequence[Maps],
+    spread: Sequence[Mapping[str, Float[np.ndarray, "h w"]]],
+    weights: Sequence[Float[np.ndarray, "h w"]],
+) -> dict[str, float]:
+    """Share of the surface whose error is within the fit's own standard deviation (`Recovered.spread`), per map, and
+    "calibration_worst", the largest distance of these shares from 0.683, that of a normal distribution.
+
+    An error is the root mean square over the albedo's channels, or over the two components of the normal's tilt.
+    """
+    w = np.concatenate([x.ravel() for x in weights]).astype(np.float64)
+    result = {}
+    for name in ("albedo", "normal", "roughness", "metallic"):
+        inside = []
+        for a, b, s in zip(truth, fitted, spread, strict=True):
+            one, two = getattr(a, name), getattr(b, name)
+            if name == "normal":
+                error = np.radians(angles(one, two)) / np.sqrt(2)
+            else:
+                error = np.sqrt(((one - two).reshape(*one.shape[:2], -1) ** 2).mean(axis=-1))
+            inside.append((error <= s[name]).ravel())
+        result[f"within_{name}"] = float((np.concatenate(inside) * w).sum() / w.sum()) if w.any() else float("nan")
+    return result | {"calibration_worst": max(abs(share - 0.683) for share in result.values())}
 
 
 def map_errors(truth: Sequence[Maps], fitted: Sequence[Maps], weights: Sequence[Float[np.ndarray, "h w"]]) -> MapErrors:

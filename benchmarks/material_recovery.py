@@ -7,13 +7,16 @@ rendered, at which resolution and with which texels: `recovery_truth.py`, `recov
 metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, ("_paper") the paper's own rig with its
 lights together, ("_soft", no rivals) 16 views x an environment map in 3 positions, and ("_unknown", no rivals) 16 views
 under one that stands still and is solved for too. Texel figures are over the surface that at least three cameras see,
-weighted by area; "confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference,
-cameras between theirs, mean over the pictures.
+weighted by area; "confident_" ones over the 95 % of it that the fit trusts most; "within_" ones are the share of it
+whose error is within the fit's own standard deviation. Relit: four lights of no reference, cameras between theirs, mean
+over the pictures.
 
 `figures` are ours. `baselines`: "constant" is the best map of one value; "other_seed" is the truth, relit with other
 random numbers than all others share: what two noisy renders of equal maps differ by; "together" is ours from the same
-pictures summed by view (all lights on); "naive" and "naive_pyramid" are `naive_fit.py` for as many seconds as ours
-took. `gain_over_naive_db` is relight_psnr_l minus that of the naive loop.
+pictures summed by view (all lights on); "naive", "naive_pyramid", "naive_prb" and "naive_prb_pyramid" are
+`naive_fit.py` with `direct` or `prb`, for as many seconds as ours took; their "_converged" forms go on until the loss
+settles, at most ten times as long (`--rivals` names them; "together", "naive" and "naive_pyramid" run without it).
+`gain_over_naive_db` is relight_psnr_l minus that of the naive loop.
 """
 
 import argparse
@@ -27,10 +30,10 @@ import numpy as np
 
 from benchmarks import recovery_pictures as drawing
 from benchmarks import recovery_report as report
-from benchmarks.material_metrics import best_constant, confident, map_errors, mean_errors, relight_errors
+from benchmarks.material_metrics import best_constant, calibration, confident, map_errors, mean_errors, relight_errors
 from benchmarks.recovery_ours import ours
 from benchmarks.recovery_pictures import Shot
-from benchmarks.recovery_rivals import naive, write_job
+from benchmarks.recovery_rivals import LOOPS, naive, write_job
 from benchmarks.recovery_truth import ASSETS, UV, Truth, data_folder, find_asset, seen, truth
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.core.maps import Maps
@@ -39,7 +42,8 @@ from mistyle.render.mitsuba.scene import Frame
 LEAST_VIEWS = 3
 RELIT_SPP = 128  # least samples of relit pictures: their own noise counts as an error of the maps
 KINDS = ("real", "strong", "paper", "soft", "unknown")
-RIVALS = ("together", "naive", "naive_pyramid")
+RIVALS = ("together", *LOOPS)
+USUAL = ("together", "naive", "naive_pyramid")
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--stanford-orb", type=Path, metavar="FOLDER", help="this data set instead, where you have it")
     parser.add_argument("--tensoir", type=Path, metavar="FOLDER", help="a scene of TensoIR-Synthetic instead")
     parser.add_argument("--environments", type=Path, metavar="FOLDER", help="TensoIR's environment maps")
-    parser.add_argument("--rivals", nargs="*", choices=RIVALS, default=list(RIVALS), help="which others to run")
+    parser.add_argument("--rivals", nargs="*", choices=RIVALS, default=list(USUAL), help="which others to run")
     options = parser.parse_args(argv)
     quick = options.quick
     options.resolution = options.resolution or (128 if quick else 512)
@@ -180,21 +184,24 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     judge = Judge(known, weights, options)
     fitted = ours(known, main_shots, main_pictures, frame, unknown=row.kind == "unknown", **chosen)
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
+    methods["ours"] |= calibration(known.maps, fitted.maps, fitted.spread, weights)
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
     methods["other_seed"] = judge.differences(judge.relit(known.maps, frame, seed=2))
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
     if row.kind in ("real", "strong") and "together" in options.rivals:
         other = ours(known, *drawing.together(shots, pictures), frame, **chosen)
         methods["together"] = judge(other.maps, frame, "together") | {"seconds": other.seconds}
-    steps = {}
-    loops = {"naive": (), "naive_pyramid": ("--pyramid",)}
-    if wanted := [method for method in loops if method in options.rivals and not row.soft]:
+    steps: dict[str, str] = {}
+    if wanted := [method for method in LOOPS if method in options.rivals and not row.soft]:
         with TemporaryDirectory() as folder:
             write_job(Path(folder), known, main_shots, main_pictures)
             for method in wanted:
-                maps, steps[method] = naive(Path(folder), known, fitted.seconds, *loops[method])
-                all_maps[method] = maps
-                methods[method] = judge(maps, "mitsuba", method) | {"seconds": fitted.seconds, "steps": steps[method]}
+                loop = naive(Path(folder), known, fitted.seconds, method)
+                all_maps[method] = loop.maps
+                figures = judge(loop.maps, "mitsuba", method)
+                methods[method] = figures | {"seconds": loop.seconds, "steps": loop.steps}
+                ended = " until the loss settled" if loop.settled else ""
+                steps[method] = f"{int(loop.steps)} steps in {loop.seconds:.0f} s{ended}"
     if "naive" in methods:
         gain = methods["ours"]["relight_psnr_l"] - methods["naive"]["relight_psnr_l"]
         methods["ours"]["gain_over_naive_db"] = gain
@@ -268,8 +275,8 @@ def describe(known: Truth, weights: Sequence[np.ndarray], pictures: Sequence[np.
     ]
 
 
-def _steps(steps: Mapping[str, float]) -> list[str]:
-    return [f"{method}: {int(n)} steps" for method, n in steps.items()]
+def _steps(steps: Mapping[str, str]) -> list[str]:
+    return [f"{method}: {text}" for method, text in steps.items()]
 
 
 if __name__ == "__main__":

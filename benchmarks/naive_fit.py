@@ -2,6 +2,7 @@
 
     python naive_fit.py JOB --seconds 60 --out maps.npz             the plain loop
     python naive_fit.py JOB --seconds 60 --out maps.npz --pyramid   the same on a Laplacian pyramid
+    python naive_fit.py JOB --seconds 3600 --out maps.npz --converge    until the loss falls no more
 
 It needs Mitsuba 3.9 and numpy, nothing else. One picture is drawn at random in each step; the textures start grey,
 flat, half rough and not metallic. JOB is a folder with `job.json`:
@@ -40,6 +41,8 @@ RATE = {False: 0.01, True: 0.003}
 # A light from one direction is only met by asking for it.
 DIRECT = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
 PRB = {"type": "prb", "max_depth": 3}
+# Converged: over SWEEPS sweeps through the pictures the mean loss is above SETTLED times that of as many before.
+SWEEPS, SETTLED = 8, 0.995
 
 
 def texture(values):
@@ -113,8 +116,17 @@ def admissible(name, values):
     return dr.clip(values, ROUGHNESS_FLOOR if name == "roughness" else 0, 1)
 
 
-def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, seed=0, progress=None):
-    """Optimise for `seconds` (loading and one step that compiles the kernels are not counted); returns the arrays."""
+def converged(losses, pictures):
+    """Whether the losses of single steps (one picture each) have settled."""
+    size = SWEEPS * pictures
+    if len(losses) < 2 * size or len(losses) % pictures:
+        return False
+    return np.mean(losses[-size:]) > SETTLED * np.mean(losses[-2 * size : -size])
+
+
+def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, seed=0, progress=None, converge=False):
+    """Optimise for `seconds` (loading and one step that compiles the kernels are not counted), with `converge` until
+    the loss has settled, if that is earlier; returns the arrays."""
     rate = rate or RATE[pyramid]
     folder = Path(folder)
     job = json.loads((folder / "job.json").read_text())
@@ -147,7 +159,7 @@ def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, s
                 params[key] = optimiser[key]
 
     rng = np.random.default_rng(seed)
-    order, step, start = [], 0, time.perf_counter()
+    order, step, start, losses = [], 0, time.perf_counter(), []
     while step < 1 or time.perf_counter() - start < seconds:
         order = order or rng.permutation(len(references)).tolist()
         k = order.pop()
@@ -163,6 +175,10 @@ def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, s
             dr.sync_thread()
             start = time.perf_counter()
         step += 1
+        if converge:
+            losses.append(float(loss.array[0]))
+            if converged(losses, len(references)):
+                break
         if progress:
             progress(min(1.0, (time.perf_counter() - start) / seconds))
     dr.eval(*(optimiser[key] for key in optimiser.keys()))
@@ -170,7 +186,7 @@ def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, s
     took = time.perf_counter() - start
     with dr.suspend_grad():
         textures()
-    result = {"steps": step - 1, "seconds": took}
+    result = {"steps": step - 1, "seconds": took, "converged": converge and converged(losses, len(references))}
     for (k, name), key in names.items():
         values = np.array(params[key])
         if name == "normal":
@@ -189,11 +205,15 @@ def main():
     parser.add_argument("--rate", type=float, help="Adam's learning rate (0.01; pyramid 0.003)")
     parser.add_argument("--samples", type=int, default=1, help="samples a pixel and step")
     parser.add_argument("--integrator", choices=["direct", "prb"], default="direct", help="prb: with interreflection")
+    parser.add_argument("--converge", action="store_true", help="end where the loss falls no more")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     options = parser.parse_args()
     mi.set_variant(options.variant)
     integrator = DIRECT if options.integrator == "direct" else PRB
-    found = fit(options.job, options.seconds, options.pyramid, options.rate, options.samples, integrator)
+    found = fit(
+        options.job, options.seconds, options.pyramid, options.rate, options.samples, integrator,
+        converge=options.converge,
+    )  # fmt: skip
     np.savez(options.out, **found)
     print(f"{found['steps']} steps in {found['seconds']:.1f} s -> {options.out}")
 

@@ -19,10 +19,12 @@ from mistyle.solver.settings import RecoverSettings
 
 @dataclass(frozen=True)
 class Fitted:
-    """Maps and confidence per texture set; seconds from pictures in memory to maps, everything included."""
+    """Maps, confidence and standard deviations per texture set; seconds from pictures in memory to maps, everything
+    included."""
 
     maps: tuple[Maps, ...]
     confidence: tuple[np.ndarray, ...]
+    spread: tuple[dict[str, np.ndarray], ...]
     seconds: float
     notes: tuple[str, ...]
 
@@ -50,4 +52,4 @@ def ours(
         light = find_light(known.mesh, captures, settings).light
         captures = replace(captures, lights=tuple((light,) for _ in cameras))
     found = recover(known.mesh, known.texels, captures, settings, seed)
-    return Fitted(found.maps, found.confidence, time.perf_counter() - start, found.notes)
+    return Fitted(found.maps, found.confidence, found.spread, time.perf_counter() - start, found.notes)

@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +44,32 @@ def write_job(folder: Path, truth: Truth, shots: Sequence[Shot], pictures: Seque
     (folder / "job.json").write_text(json.dumps({"fov": FOV, "shapes": shapes, "pictures": entries}, indent=1))
 
 
-def naive(folder: Path, truth: Truth, seconds: float, *options: str) -> tuple[list[Maps], float]:
-    """Run the loop on `write_job`'s folder; its maps, and the steps it took."""
+# Options of each loop; the converged ones end where their loss settles, or after CONVERGED times our seconds.
+LOOPS = {
+    "naive": (),
+    "naive_pyramid": ("--pyramid",),
+    "naive_prb": ("--integrator", "prb"),
+    "naive_prb_pyramid": ("--integrator", "prb", "--pyramid"),
+}
+LOOPS |= {f"{name}_converged": (*options, "--converge") for name, options in LOOPS.items()}
+CONVERGED = 10
+
+
+@dataclass(frozen=True)
+class NaiveFit:
+    """Maps of a loop, its steps and seconds, and whether its loss had settled."""
+
+    maps: list[Maps]
+    steps: float
+    seconds: float
+    settled: bool
+
+
+def naive(folder: Path, truth: Truth, seconds: float, name: str) -> NaiveFit:
+    """Run the loop `name` of LOOPS on `write_job`'s folder for `seconds`, a converged one for at most CONVERGED times
+    as many."""
+    options = LOOPS[name]
+    seconds *= CONVERGED if "--converge" in options else 1
     out = folder / "maps.npz"
     command = [sys.executable, str(NAIVE), str(folder), "--seconds", f"{seconds:.2f}", "--out", str(out), *options]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -58,4 +83,4 @@ def naive(folder: Path, truth: Truth, seconds: float, *options: str) -> tuple[li
             )
             for k, texels in enumerate(truth.texels)
         ]
-        return maps, float(found["steps"])
+        return NaiveFit(maps, float(found["steps"]), float(found["seconds"]), bool(found["converged"]))

@@ -80,7 +80,7 @@ def time_to_quality(
 
     with TemporaryDirectory() as folder:
         write_job(Path(folder), known, shots, pictures)
-        maps, _ = naive(Path(folder), known, seconds)
+        maps = naive(Path(folder), known, seconds, "naive").maps
     wanted = quality(maps, "mitsuba")
     best = TimeToQuality(float("inf"), seconds, wanted, float("inf"), float("-inf"), {})
     for effort in EFFORTS:

@@ -42,6 +42,8 @@ class FitSettings(TypedDict, total=False):
     seed: int
     threads: int
     memory: float
+    passes: int
+    minutes: float
     variant: Variant
     start: Literal["nothing", "own"]
     read: Stage

@@ -40,6 +40,8 @@ OPTIONS = {
     "frame": "recover.frame",
     "metallic": "recover.metallic",
     "iterations": "recover.iterations",
+    "passes": "passes",
+    "minutes": "minutes",
     "memory": "memory",
     **REPORT_OPTIONS,
     **DELIVERY_OPTIONS,
@@ -74,7 +76,9 @@ def add_fit(verbs: Any) -> None:
     )
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; rerun to resume")
     verb.add_argument("--dry-run", action="store_true", help="print estimated time, memory and disk, and stop")
-    add_job_options(verb, ("draft", "standard"), "draft: a texture of 512²; standard (default): 1024²")
+    add_job_options(
+        verb, ("draft", "standard"), "draft: a texture of 512² and a ninth of the steps; standard (default): 1024²"
+    )
     add_memory_option(verb)
     add_mesh_options(verb)
     _add_reference_options(verb)
@@ -115,6 +119,8 @@ def _add_material_options(verb: argparse.ArgumentParser) -> None:
     group.add_argument("--metallic", action="store_true", default=None, help="fit metalness too")
     group.add_argument("--start", choices=["nothing", "own"], help="own: start from the mesh's own material")
     group.add_argument("--iterations", type=int, metavar="N", help="steps of the gradient stage")
+    group.add_argument("--minutes", type=float, metavar="M", help="end the fit after M minutes with its best result")
+    group.add_argument("--passes", type=int, metavar="N", help="end the fit after N passes: the same bytes every time")
     group.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     add_report_option(verb)
     add_delivery_options(verb)
@@ -255,6 +261,7 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         for label in ("asset", "textures", "scene", "report", "picture"):
             if label in summary:
                 print(f"{label:<9} {summary[label]}", file=sys.stderr)
+        print(f"{'passes':<9} {summary['passes']['done']} of {summary['passes']['planned']}", file=sys.stderr)
         for name, value in summary["figures"].items():
             print(f"{name:<17} {value:.4g}", file=sys.stderr)
     progress.tell_notes()

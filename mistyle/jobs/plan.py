@@ -26,11 +26,6 @@ PER_CROP_PIXEL = 1.6e-6
 PER_VGG_PIXEL = 7e-6  # of a crop of the finish: twice forward, once back, to relu3_1
 # Fits to pictures:
 PER_READ_PIXEL = 8e-7  # a pixel read and undistorted
-PER_LOOK = 2e-7  # a sample of a pixel, predicted or in a step
-PER_OBSERVATION = 4e-7  # a texel in a picture, in one step of a solve; a first solve has two starts
-PER_BOUNCED_PATH = 1e-7  # a path of light between surfaces
-PER_SMOOTHED = 1.5e-5  # a covered texel in one smoothing pass over its neighbours
-PER_JOINT = 1.5e-5  # a pixel that shows the object, in each joint step
 
 PER_TABLE_PIXEL = 4e-8  # of all views, for each texture set that is baked
 

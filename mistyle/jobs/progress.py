@@ -38,7 +38,7 @@ class Progress:
             print(text, file=sys.stderr, flush=True)
 
     @contextmanager
-    def stage(self, name: str, what: str) -> Iterator[Report]:
+    def stage(self, name: str, what: str) -> "Iterator[StageReport]":
         """Run a stage: yields a callback for the completed share, 0..1."""
         start = time.perf_counter()
         with memory.watched() as most:
@@ -69,32 +69,81 @@ def grouped(notes: Iterable[tuple[str, str]]) -> list[str]:
     ]
 
 
+class Remaining:
+    """Estimates the seconds left from completed shares: the time of the share done so far, carried on.
+
+    Shares are proportional to planned seconds where a stage knows them. An estimate exceeds the previous one by
+    GROWTH at most, so that one slow step does not make the end seem far.
+    """
+
+    GROWTH = 1.25
+
+    def __init__(self) -> None:
+        self._begin, self._last = (time.perf_counter(), 0.0), float("inf")
+
+    def begin_at(self, done: float) -> None:
+        """An earlier run did this share; it does not count as fast work."""
+        self._begin = time.perf_counter(), done
+
+    def __call__(self, done: float) -> float | None:
+        """Seconds left, None without an estimate."""
+        start, first = self._begin
+        if not first < done < 1:
+            return None
+        left = (time.perf_counter() - start) / (done - first) * (1 - done)
+        self._last = min(left, self.GROWTH * self._last)
+        return self._last
+
+
+class StageReport:
+    """Receives the completed share of a stage, 0..1, and shows it through `show(share, seconds left)`."""
+
+    def __init__(self, show: Callable[[float, Callable[[], float | None]], None]) -> None:
+        self._show, self._remaining = show, Remaining()
+
+    def __call__(self, done: float) -> None:
+        self._show(done, lambda: self._remaining(done))
+
+    def begin_at(self, done: float) -> None:
+        """A resumed stage begins with this share."""
+        self._remaining.begin_at(done)
+        self(done)
+
+
 @contextmanager
-def _bar(what: str) -> Iterator[Report]:
+def _bar(what: str) -> Iterator[StageReport]:
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bars
 
     columns = [
         TextColumn("{task.description:<42}"),
         BarColumn(),
         TimeElapsedColumn(),
-        TimeRemainingColumn(compact=True),
+        TextColumn("{task.fields[left]}"),
     ]
     with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task(what, total=1.0)
-        yield lambda done: bars.update(task, completed=min(max(done, 0.0), 1.0))
+        task, shown = bars.add_task(what, total=1.0, left=""), [0.0]
+
+        def show(done: float, left: Callable[[], float | None]) -> None:
+            now = time.perf_counter()
+            if now - shown[0] >= 1:
+                shown[0], seconds = now, left()
+                text = "" if seconds is None else f"{int(seconds // 60)}:{int(seconds % 60):02d} left"
+                bars.update(task, left=text)
+            bars.update(task, completed=min(max(done, 0.0), 1.0))
+
+        yield StageReport(show)
 
 
-def _lines(what: str, say: Callable[[str], None], every: float = 20.0) -> Report:
+def _lines(what: str, say: Callable[[str], None], every: float = 20.0) -> StageReport:
     """A progress line every `every` seconds: logs of a farm stay short."""
-    start = last = time.perf_counter()
+    last = [time.perf_counter()]
 
-    def report(done: float) -> None:
-        nonlocal last
+    def show(done: float, left: Callable[[], float | None]) -> None:
         now = time.perf_counter()
-        if now - last >= every and 0 < done < 1:
-            last = now
-            say(f"  {what}: {100 * done:.0f} %, about {(now - start) / done * (1 - done):.0f} s left")
+        if now - last[0] >= every and 0 < done < 1:
+            last[0], seconds = now, left()
+            say(f"  {what}: {100 * done:.0f} %" + ("" if seconds is None else f", about {seconds:.0f} s left"))
 
-    return report
+    return StageReport(show)

@@ -14,7 +14,7 @@ from mistyle.io.store.atomic import digest
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.records import load_record, save_record
 from mistyle.jobs import edits
-from mistyle.jobs.progress import Progress, Report
+from mistyle.jobs.progress import Progress, StageReport
 from mistyle.jobs.settings import thread_count
 from mistyle.process import memory, stopping
 
@@ -97,7 +97,7 @@ class Run(Generic[JobT]):
         name: str,
         after: Sequence[str],
         inputs: Any,
-        write: Callable[[Path, Report], object],
+        write: Callable[[Path, StageReport], object],
         about: Mapping[str, Any] = NOTHING,
     ) -> Path:
         """The folder of stage `name`, reused or computed; it depends on `inputs` and on the stages `after`.
@@ -129,7 +129,7 @@ class Run(Generic[JobT]):
             self.keys[name] = digest([self.base, name, "left out", [self.keys[a] for a in after]])
 
     def early(
-        self, name: str, key: str, what: str, write: Callable[[Path, Report], object], about: Mapping[str, Any]
+        self, name: str, key: str, what: str, write: Callable[[Path, StageReport], object], about: Mapping[str, Any]
     ) -> None:
         """Write a preliminary result of the visible stage `name`, under a `key` of its own.
 
@@ -140,7 +140,14 @@ class Run(Generic[JobT]):
         with self.progress.stage(f"first {name}", what) as report:
             self.visible.put(name, key, lambda folder: write(folder, report), about=about)
 
-    def absorb(self, name: str, write: Callable[[Path, Report], object], about: Mapping[str, Any] = NOTHING) -> Path:
+    def preliminary(self, name: str, key: str, write: Callable[[Path], object], about: Mapping[str, Any]) -> None:
+        """`early` within a running stage, without a progress line of its own."""
+        self._set_edits_aside(self.visible, name)
+        self.visible.put(name, key, write, about=about)
+
+    def absorb(
+        self, name: str, write: Callable[[Path, StageReport], object], about: Mapping[str, Any] = NOTHING
+    ) -> Path:
         """Write a reused stage again with its folder's edits, which then belong to its result."""
         keeper, edited = self.visible, self.edited[name]
 
@@ -175,11 +182,11 @@ class Run(Generic[JobT]):
             text = f"{name}/ is written again, since its inputs have changed; your edited {files} now lies in {place}."
             self.progress.note(text)
 
-    def record(self, name: str, after: Sequence[str], inputs: Any, make: Callable[[Report], Any]) -> Any:
+    def record(self, name: str, after: Sequence[str], inputs: Any, make: Callable[[StageReport], Any]) -> Any:
         """Like `stage`, for a stage whose result is a record."""
         results: list[Any] = []
 
-        def write(folder: Path, report: Report) -> None:
+        def write(folder: Path, report: StageReport) -> None:
             results.append(make(report))
             save_record(folder / "record", results[0])
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.capture import Captures, Loaded
+from mistyle.core.light import has_soft
 from mistyle.core.maps import Texels
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.indirect import enlarged
@@ -49,12 +50,14 @@ class FitContext:
         """A renderer of tables of this atlas; `memory` in bytes. Arguments left out come from the settings."""
         from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
-        s = self.settings
+        s, soft = self.settings, has_soft(self.captures.lights)
+        usual = s.soft_subsamples if soft else s.subsamples
         options = RenderOptions(
             model=s.model,
             frame=s.frame,
-            subsamples=s.subsamples if subsamples is None else subsamples,
+            subsamples=usual if subsamples is None else subsamples,
             shadows=s.shadows,
+            directions=s.soft_cells,
             memory=s.memory * 1e9 if memory is None else memory,
             gradients=gradients,
         )

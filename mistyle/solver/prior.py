@@ -15,9 +15,9 @@ METAL_SPREAD = 0.1  # standard deviation of metallic about 0 or 1: few surfaces 
 # F0 of metals and its standard deviation. Without a visible highlight, a smooth metal of high F0 looks like a rough one
 # of low F0; this prior decides.
 METAL_ALBEDO, METAL_ALBEDOS = 0.6, 0.2
-METAL_COST = 10.0  # -2 log of the prior odds of a metal
+METAL_COST = 8.0  # -2 log of the prior odds of a metal
 # Cost of a black dielectric, the albedo from which it is zero, and the observations at which it is full.
-BLACK_COST, PALEST_BLACK, OFTEN = 20.0, 0.02, 8
+BLACK_COST, PALEST_BLACK, OFTEN = 4.0, 0.02, 8
 # Roughness range over which a highlight becomes visible, so that the texel cannot be a mirror instead.
 GLOSSY, MATT = 0.3, 0.6
 BLUR = 4  # diffusion steps, each over the four nearest texels, of a mean of neighbours

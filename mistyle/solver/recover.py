@@ -13,25 +13,45 @@ cameras are fixed. A common factor of light and albedo is not identifiable: albe
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures
+from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.stage_progress import StageProgress
+from mistyle.process import stopping
+from mistyle.render.deferred.image_samples import window
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.joint.gauss_newton import joint_gauss_newton, where_possible
-from mistyle.solver.pictures.descend import Checkpoints, optimise_on_pictures
+from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
+from mistyle.solver.journal import Checkpoints, Journal, TimeOver
+from mistyle.solver.pass_state import PassState, arrays_of, state_from
+from mistyle.solver.pictures.descend import picture_pass, settled
+from mistyle.solver.schedule import FILLED, Pass, Size, schedule, shares, size_from
 from mistyle.solver.settings import RecoverSettings, descent_steps
 from mistyle.solver.smoothing import map_smoothing
 from mistyle.solver.table import atlas_of, linked
-from mistyle.solver.texels.solve import TexelEstimate, solve_level
+from mistyle.solver.texels.solve import (
+    TexelEstimate,
+    TexelLevel,
+    estimate_of,
+    first_solution,
+    solution_after_rounds,
+    texel_level,
+)
 from mistyle.solver.validate import validate_captures
 
-__all__ = ["Checkpoints", "RecoverSettings", "Recovered", "recover"]
+if TYPE_CHECKING:
+    from mistyle.render.deferred.renderer import MaterialRenderer
+
+__all__ = ["Checkpoints", "Limits", "Reached", "RecoverSettings", "Recovered", "recover"]
+
+PATIENCE = 3.0  # seconds that a stop request waits for a point where the state is consistent
 
 # Standard deviations at which a texel's confidence is a half: normal (sine), roughness, albedo, metallic.
 HALF_SURE = {"normal": 0.05, "roughness": 0.1, "albedo": 0.05, "metallic": 0.2}
@@ -56,6 +76,7 @@ class Recovered:
     trace       values per round and step, by name
     residuals   per picture by its name: root mean square of reference - render, relative to the reference's
     notes       sentences for the report
+    passes      number of passes, and how many were `planned`
     """
 
     maps: tuple[Maps, ...]
@@ -66,6 +87,38 @@ class Recovered:
     trace: dict[str, list[float]]
     residuals: dict[str, float]
     notes: tuple[str, ...]
+    passes: int = 0
+    planned: int = 0
+
+
+@dataclass(frozen=True)
+class Reached:
+    """A recovery after some of its `planned` passes, for whoever watches it."""
+
+    done: int
+    planned: int
+    work: "_Work"
+    state: PassState
+
+    def maps(self, smooth: bool = True) -> tuple[Maps, ...]:
+        """The maps so far; those of passes on whole pictures are not smoothed, and none without `smooth`, to be
+        quick."""
+        estimate = self.work.estimate(self.state, smooth)
+        return _maps(self.work.context, estimate, estimate.table if self.state.table is None else self.state.table)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a recovery ends: after so many `passes`, 0 for all, or with the first pass that would exceed `deadline`, a
+    value of `time.monotonic`. `watch` is called after each pass, `resumed` with the share that a checkpoint holds."""
+
+    passes: int = 0
+    deadline: float = float("inf")
+    watch: Callable[[Reached], None] = lambda reached: None
+    resumed: Callable[[float], None] = lambda share: None
+
+
+NO_LIMITS = Limits()
 
 
 def recover(
@@ -78,12 +131,14 @@ def recover(
     *,
     start: Sequence[Maps] | None = None,
     checkpoints: Checkpoints = NO_CHECKPOINTS,
+    limits: Limits = NO_LIMITS,
 ) -> Recovered:
-    """Fit one set of maps per texture set to `captures`; equal input, settings, seed and threads give equal bytes.
+    """Fit one set of maps per texture set to `captures`; equal input, settings, seed, passes and threads give equal
+    bytes.
 
     `start` maps initialise the solver and keep their metallic unless it is fitted. `checkpoints` save the state from
     which a later call ends with the same bytes. Unusable pictures are skipped with a note. Raises InputRefused if all
-    are.
+    are, and Stopped, after a checkpoint, on a stop request.
     """
     from mistyle.render.deferred.image_samples import tangents_of
     from mistyle.render.mitsuba.draw import tracer
@@ -94,29 +149,174 @@ def recover(
     grid = atlas_of(texels) if settings.solver == "pictures" else linked(mesh, texels)
     tangents = tangents_of(mesh, settings.frame)
     context = FitContext(traced, tangents, texels, grid, usable, settings, seed, notes)
-    part, descends = StageProgress(progress).part, descent_steps(settings) > 0
-    renderer = context.renderer(gradients=descends)
-    estimate, direct = solve_level(context, renderer, start, part(0, 0.5))
-    renderer.retarget(direct.direct_only(), direct.pixel_confidence)
-    if estimate.solved and settings.smooth:
-        table = map_smoothing(estimate.table, estimate.unconstrained, grid, settings.roughness_floor, settings.metallic)
-        estimate = replace(estimate, table=table)
-    table = estimate.table
-    if descends:
-        table, direct = optimise_on_pictures(context, renderer, estimate, direct, part(0.5, 0.85), checkpoints)
-        if estimate.solved and settings.joint:
-            # This renderer has finer pictures; the samples of the other one are freed first.
-            renderer = context.renderer(subsamples=settings.joint_subsamples, memory=0)
-            table, direct = joint_gauss_newton(context, renderer, table, direct, part(0.85, 0.95))
-    if settings.polish:
-        table = polished(context, table, part(0.95, 1))
-    uploaded = renderer.upload(table)
-    residuals = {
-        camera.name: _residual(direct, renderer.image_and_coverage(uploaded, k), k)
-        for k, camera in enumerate(usable.cameras)
-    }
+    journal = Journal(checkpoints, settings.checkpoint, limits.deadline)
+
+    def report(done: float) -> None:
+        progress(done)
+        journal.poll()
+
+    with stopping.at_checkpoints(PATIENCE):
+        work = _Work(context, start, journal, StageProgress(report))
+        state, planned = work.run(limits)
+        table, estimate = work.result(state)
+        renderer = work.renderer(state)
+        uploaded = renderer.upload(table)
+        residuals = {
+            camera.name: _residual(state.direct, renderer.image_and_coverage(uploaded, k), k)
+            for k, camera in enumerate(usable.cameras)
+        }
     progress(1.0)
-    return _recovered(context, estimate, table, residuals)
+    return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
+
+
+class _Work:
+    """Runs the passes; a class, since renderers and problems are built when a pass first needs them, and freed."""
+
+    def __init__(
+        self, context: FitContext, start: Sequence[Maps] | None, journal: Journal, progress: StageProgress
+    ) -> None:
+        self.context, self.start, self.journal, self.progress = context, start, journal, progress
+        self._level: TexelLevel | None = None
+        self._renderer: MaterialRenderer | None = None
+        self._joint: JointSetup | None = None
+        self._targets: DirectCaptures | None = None
+        self._estimates: tuple[PassState, TexelEstimate] | None = None
+
+    def run(self, limits: Limits) -> tuple[PassState, int]:
+        """The state after the last pass within the limits, and the number of planned passes."""
+        context, journal = self.context, self.journal
+        settings, pictures = context.settings, len(context.captures)
+        state, solved = PassState(DirectCaptures(context.captures)), settings.solver != "pictures"
+        planned = schedule(settings, pictures, solved)
+        done = shares(settings, planned, size_of(context))
+        if journal.resumed is not None:
+            state = self._resumed(limits.passes or len(planned)) or state
+        if state.done:
+            limits.resumed(done[state.done])
+        if solved and not state.done:
+            solved = self.level(self.progress.part(0, done[0])).problem is not None
+        elif state.estimate is not None:
+            solved = state.estimate.solved
+        planned = schedule(settings, pictures, solved)
+        done = shares(settings, planned, size_of(context))
+        for k in range(state.done, min(limits.passes or len(planned), len(planned))):
+            kinds = [one.kind for one in planned[k : k + 2]]
+            try:
+                journal.begin(arrays_of(state, context), k)
+                state = self._after(state, planned[k], self.progress.part(done[k], done[k + 1]))
+                if kinds[0] == "pictures" and kinds[1:] != ["pictures"]:
+                    state = settled(context, self.renderer(state), state)
+            except TimeOver:
+                journal.save()
+                return state_from(journal.state, context), len(planned)
+            state = replace(state, done=k + 1)
+            limits.watch(Reached(k + 1, len(planned), self, state))
+        if state.done < len(planned):
+            # A later call with wider limits continues here.
+            journal.begin(arrays_of(state, context), 0)
+            journal.save()
+        return state, len(planned)
+
+    def result(self, state: PassState) -> tuple[MaterialTable, TexelEstimate]:
+        """The final table of a state, smoothed, and the texels' estimate."""
+        estimate, settings = self.estimate(state), self.context.settings
+        if state.table is None:
+            return estimate.table, estimate
+        if not state.settled and settings.solver != "texels":
+            state = settled(self.context, self.renderer(state), state)
+        assert state.table is not None
+        return state.table, estimate
+
+    def estimate(self, state: PassState, smooth: bool = True) -> TexelEstimate:
+        """The texels' estimate of a state."""
+        if state.estimate is not None:
+            return state.estimate
+        if self._estimates is None or self._estimates[0] is not state:
+            context, settings = self.context, self.context.settings
+            estimate = estimate_of(self.level(), state.solution, context)
+            if not smooth:
+                return estimate
+            if estimate.solved and settings.smooth:
+                arguments = context.atlas, settings.roughness_floor, settings.metallic
+                table = map_smoothing(estimate.table, estimate.unconstrained, *arguments)
+                estimate = replace(estimate, table=table)
+            self._estimates = state, estimate
+        return self._estimates[1]
+
+    def level(self, progress: Callable[[float], None] = lambda done: None) -> TexelLevel:
+        """The per-texel problem."""
+        if self._level is None:
+            self._level = texel_level(self.context, lambda: self.renderer(None), self.start, progress)
+        return self._level
+
+    def renderer(self, state: PassState | None) -> "MaterialRenderer":
+        """The renderer of the whole atlas, with the references of a state."""
+        if self._renderer is None:
+            self._renderer, self._targets = (
+                self.context.renderer(gradients=descent_steps(self.context.settings) > 0),
+                None,
+            )
+        if state is not None and state.direct is not self._targets:
+            self._renderer.retarget(state.direct.direct_only(), state.direct.pixel_confidence)
+            self._targets = state.direct
+        return self._renderer
+
+    def _resumed(self, passes: int) -> PassState | None:
+        """The state of the checkpoint, unless it is beyond the last pass."""
+        assert self.journal.resumed is not None
+        state = state_from(self.journal.resumed, self.context)
+        if state.done <= passes:
+            return state
+        self.journal.earlier = {}
+        return None
+
+    def _after(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:
+        """The state after a pass."""
+        context, journal = self.context, self.journal
+        if one.kind == "solve":
+            return replace(state, solution=first_solution(self.level(), journal, progress))
+        if one.kind == "rounds":
+            assert state.solution is not None
+            start = state.solution, state.direct
+            solution, direct = solution_after_rounds(self.level(), start, one, journal, progress)
+            return replace(state, solution=solution, direct=direct)
+        if state.estimate is None:
+            state = replace(state, estimate=self.estimate(state), solution=None)
+            self._level = self._estimates = None
+        if one.kind == "pictures":
+            state = picture_pass(context, self.renderer(state), state, one, journal, progress)
+            self._targets = state.direct
+            return state
+        if one.kind == "joint":
+            return state if state.over else self._joint_pass(state, one, progress)
+        table = self.result(state)[0]
+        return replace(state, table=polished(context, table, progress), settled=True)
+
+    def _joint_pass(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:
+        if self._joint is None:
+            # This renderer has finer pictures; the samples of the other one are freed first.
+            self._renderer = None
+            renderer = self.context.renderer(subsamples=self.context.settings.joint_subsamples, memory=0)
+            self._joint = joint_setup(self.context, renderer)
+            self._renderer, self._targets = renderer, None
+        if self._joint is None:
+            return replace(state, over=True)
+        return joint_pass(self.context, self._joint, state, one, self.journal, progress)
+
+
+def size_of(context: FitContext) -> Size:
+    """Counts of a recovery, for its seconds."""
+    settings, cameras = context.settings, context.captures.cameras
+    covered, soft = sum(int(c.sum()) for c in context.atlas.covered), has_soft(context.captures.lights)
+    pixels = [camera.size[0] * camera.size[1] for camera in cameras]
+    return size_from(settings, pixels, covered, soft, shown_in(context.traced.mesh, cameras))
+
+
+def shown_in(mesh: Mesh, cameras: Sequence[Camera]) -> float:
+    """Approximate share of the pictures that shows the mesh: FILLED of its bounding boxes."""
+    boxes = [window(mesh, camera) for camera in cameras]
+    box = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in boxes)
+    return FILLED * box / sum(camera.size[0] * camera.size[1] for camera in cameras)
 
 
 def polished(context: FitContext, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable:
@@ -152,8 +352,6 @@ def _residual(direct: DirectCaptures, drawn: tuple[np.ndarray, np.ndarray], k: i
 def _recovered(
     context: FitContext, estimate: TexelEstimate, table: MaterialTable, residuals: dict[str, float]
 ) -> Recovered:
-    from mistyle.render.deferred.material_table import unpack
-
     grid, settings = context.atlas, context.settings
     names = [n for n in CHANNELS if n != "metallic" or settings.metallic]
     variance = {n: (estimate.std[:, CHANNELS[n]] ** 2).mean(axis=1) for n in CHANNELS}
@@ -164,10 +362,9 @@ def _recovered(
         return tuple(values[part].reshape(size) for part, size in zip(grid.parts, grid.sizes, strict=True))
 
     seen = grids(estimate.seen.astype(np.int32))
-    maps = [replace(m, known=s > 0) for m, s in zip(unpack(table, grid.sizes), seen, strict=True)]
     spreads = {n: grids(np.sqrt(v).astype(np.float32)) for n, v in variance.items()}
     return Recovered(
-        maps=tuple(maps),
+        maps=_maps(context, estimate, table),
         confidence=grids(sure),
         spread=tuple({n: spreads[n][k] for n in CHANNELS} for k in range(len(grid.sizes))),
         seen=seen,
@@ -176,3 +373,11 @@ def _recovered(
         residuals=residuals,
         notes=tuple(context.notes),
     )
+
+
+def _maps(context: FitContext, estimate: TexelEstimate, table: MaterialTable) -> tuple[Maps, ...]:
+    """A table as maps, `known` where a picture observed the texel in the light."""
+    from mistyle.render.deferred.material_table import unpack
+
+    sets = zip(unpack(table, context.atlas.sizes), context.atlas.parts, strict=True)
+    return tuple(replace(m, known=estimate.seen[part].reshape(m.known.shape) > 0) for m, part in sets)

@@ -36,7 +36,7 @@ class RecoverSettings(BaseModel):
     solver_texels: int = Field(
         default=2_000_000,
         ge=1,
-        description="most texels of the per-texel solver, under soft light a 64th of it; a finer atlas is solved at a "
+        description="most texels of the per-texel solver, under soft light a 16th of it; a finer atlas is solved at a "
         "coarser level",
     )
     solver_iterations: int = Field(default=12, ge=1, le=1000, description="Levenberg-Marquardt steps from each start")
@@ -86,6 +86,15 @@ class RecoverSettings(BaseModel):
         le=64,
         description="samples a pixel, a square number; with 4 the gradient's error at highlights triples",
     )
+    soft_subsamples: int = Field(
+        default=4, ge=1, le=64, description="samples a pixel under environments and ambient light, a square number"
+    )
+    soft_cells: int = Field(
+        default=32,
+        ge=8,
+        le=512,
+        description="cells of such light in a sample; samples see different parts of each, so their mean has more",
+    )
     roughness_floor: float = Field(
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
     )
@@ -131,7 +140,7 @@ class RecoverSettings(BaseModel):
     memory: float = Field(default=4.0, gt=0, description="GB for cached samples of the pictures")
     checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")
 
-    @field_validator("subsamples", "joint_subsamples")
+    @field_validator("subsamples", "joint_subsamples", "soft_subsamples")
     @classmethod
     def _square(cls, value: int) -> int:
         if isqrt(value) ** 2 != value:

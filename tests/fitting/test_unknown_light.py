@@ -142,6 +142,7 @@ def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
     rows = len(own.owner)
     by_texel = rng.normal(0, 1, (rows, 3, 7)).astype(np.float32) * own.used[:, None, None]
     by_texel[:, :, own.free :] = 0
+    by_texel[:, :, :3] *= np.eye(3)  # a channel depends on its own albedo alone
     by_light = [rng.random((rows, cells)).astype(np.float32) * own.used[:, None] for _ in range(3)]
     wrong = rng.normal(0, 1, (rows, 3)) * own.used[:, None]
     values = light_solve.first_values(own) + rng.normal(0, 0.1, (count, 7)).astype(np.float32)
@@ -162,6 +163,22 @@ def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
         pulled += g.T @ j @ inverse @ pull
     assert len(told) > 50 and np.abs(lost - expected).max() < 1e-5 * np.abs(expected).max()
     assert np.abs(slope - pulled).max() < 1e-4 * np.abs(pulled).max()
+
+
+@pytest.mark.parametrize("size", [12, 90])
+def test_light_at_least_zero_is_the_optimum_that_scipy_finds(size):
+    from scipy.optimize import nnls
+
+    rng = np.random.default_rng(size)
+    root = rng.normal(size=(size + 5, size)) * np.exp(rng.normal(size=size))
+    matrix, rhs = root.T @ root, 3 * rng.normal(size=size)
+    level = light_solve.LEAST_CURVATURE * np.trace(matrix) / size
+    factor = np.linalg.cholesky(matrix + level * np.eye(size))
+    expected = nnls(factor.T, np.linalg.solve(factor, rhs))[0]
+    assert 0 < (expected > 0).sum() < size
+    for near in (np.zeros((size // 3, 3)), rng.random((size // 3, 3))):
+        found = light_solve._least_squares(matrix.copy(), rhs, near).T.ravel()
+        np.testing.assert_allclose(found, expected, atol=1e-6 * expected.max())
 
 
 def test_shares_add_up_to_the_prediction(mesh, captures):

@@ -25,7 +25,7 @@ from mistyle.solver.indirect import FIREFLY, MOST, Indirect, averaged, enlarged,
 from mistyle.solver.pictures import descend as recover_pictures
 from mistyle.solver.pictures.descend import SHORTEST
 from mistyle.solver.prior import NOTHING
-from mistyle.solver.recover import Checkpoints, recover
+from mistyle.solver.recover import recover
 from mistyle.solver.settings import RecoverSettings, estimates, passes
 from mistyle.solver.table import Atlas
 from mistyle.solver.texels import observations as recover_observe
@@ -263,24 +263,6 @@ def test_neighbours_help_against_noise_and_where_little_is_known(world, rng, ste
     (angle, roughness), (smooth_angle, smooth_roughness) = found
     assert smooth_angle < most * angle
     assert smooth_roughness < most * roughness
-
-
-def test_the_same_bytes_again_and_after_an_interruption(world):
-    """One run, and those that go on after each of its checkpoints: one before light between surfaces is estimated for
-    the last time, one after."""
-    mesh, _, texels, captures = world
-    some = subset(captures, range(0, 30, 5))
-    update = {"iterations": 36, "rounds": 1, "bounces": 2, "bounce_samples": 8, "checkpoint": 1e-9}
-    settings = QUICK.model_copy(update=update)
-    states = []
-    whole = recover(mesh, [texels], some, settings, 5, checkpoints=Checkpoints(save=states.append))
-    assert [int(s["iteration"]) for s in states] == [6, 18, 24, 30]
-    assert all(isinstance(v, np.ndarray) and v.dtype != object for s in states for v in s.values())
-    for state in states:
-        resumed = recover(mesh, [texels], some, settings, 5, checkpoints=Checkpoints(resume=state))
-        for name in ("albedo", "normal", "roughness", "metallic"):
-            assert getattr(whole.maps[0], name).tobytes() == getattr(resumed.maps[0], name).tobytes(), name
-        assert whole.trace == resumed.trace
 
 
 def test_an_atlas_too_fine_is_solved_at_a_coarser_level(world):

@@ -34,8 +34,10 @@ FLAT = 0.05  # floor of the brightness that scales differences, as a share of th
 CONVENTION = 0.1  # weight of the mean light's squared relative distance from the convention, per observation
 STEP = 0.01  # of finite differences by tilt, roughness and metallic
 BLOCK = 1024  # texels per batch
-TRIES, STEPS = 5, 15  # damping values per step; iterations of the texel solver after it
-SETTLED = 1e-3  # relative decrease of the cost that counts as convergence
+TRIES, INNER = 5, 8  # damping values per step; iterations of the texel solver after it
+SETTLED = 2e-3  # relative decrease of the cost that counts as convergence
+LEAST_CURVATURE = 1e-7  # added to the diagonal of the light's matrix, relative to its mean
+EXCHANGES = 3  # block exchanges without progress before single ones
 
 Values = Float[np.ndarray, "t 7"]
 
@@ -114,7 +116,7 @@ def light_over(bundled: Bundle, radiance: Radiance, values: Values) -> Radiance:
     flat = radiance.T.ravel()
     damping = 1e-3 * np.diag(np.diag(matrix))
     full = matrix + damping + _smoothness(bundled.cells, radiance)
-    return _least_squares(full, gradient + (matrix + damping) @ flat)
+    return _least_squares(full, gradient + (matrix + damping) @ flat, radiance)
 
 
 def solve_light_and_texels(
@@ -140,8 +142,8 @@ def solve_light_and_texels(
         for _ in range(TRIES):
             damped = damping * np.diag(np.diag(matrix + smooth))
             rhs = gradient + (matrix + damped) @ flat + weight * means.sum(axis=0)
-            radiance = _least_squares(matrix + damped + smooth + weight * means.T @ means, rhs)
-            tried = texels_under(bundled, radiance, state.values, STEPS)
+            radiance = _least_squares(matrix + damped + smooth + weight * means.T @ means, rhs, state.radiance)
+            tried = texels_under(bundled, radiance, state.values, INNER)
             after = total(tried)
             if after < before:
                 break
@@ -219,10 +221,15 @@ def _at_bounds(bundled: Bundle, values: Values) -> Bool[np.ndarray, "t 7"]:
 def _schur_terms(
     bundled: Bundle, values: Values, by_texel: np.ndarray, by_light: Sequence[np.ndarray], residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The texels' part of the Schur complement: subtracted from the light's matrix and gradient."""
+    """The texels' part of the Schur complement: subtracted from the light's matrix and gradient.
+
+    A channel's albedo meets only that channel's light. It comes first in the Cholesky factor, so its rows of the
+    whitened cross terms have one block; the other unknowns' rows have three.
+    """
     cells, start, prior = len(bundled.cells.angle), bundled.observed.observations.start, np.array(SPREAD) ** -2.0
-    seen = np.flatnonzero(bundled.observed.seen >= LEAST_SEEN)
+    seen, free = np.flatnonzero(bundled.observed.seen >= LEAST_SEEN), bundled.free
     schur, slope = np.zeros((3 * cells, 3 * cells)), np.zeros(3 * cells)
+    blocks = [slice(c * cells, (c + 1) * cells) for c in range(3)]
     for low in range(0, len(seen), BLOCK):
         texel = seen[low : low + BLOCK]
         # Texels between them have too few observations and zero weight: the sums may include them.
@@ -232,17 +239,24 @@ def _schur_terms(
         def summed(per_row: np.ndarray, at=at) -> np.ndarray:
             return np.add.reduceat(per_row, at, axis=0)
 
-        own = by_texel[rows]
-        normal = summed(np.einsum("oci,ocj->oij", own, own)).astype(float) + np.diag(prior)
-        rhs = summed(np.einsum("oci,oc->oi", own, residual[rows])) - prior * (values[texel] - np.array(MEAN))
-        cross = np.zeros((len(texel), 7, 3 * cells))
-        for c in range(3):
-            for k in range(bundled.free):
-                cross[:, k, c * cells : (c + 1) * cells] = summed(own[:, c, k : k + 1] * by_light[c][rows])
+        own = by_texel[rows][:, :, :free]
+        normal = summed(np.einsum("oci,ocj->oij", own, own)).astype(float) + np.diag(prior[:free])
+        rhs = summed(np.einsum("oci,oc->oi", own, residual[rows]))
+        rhs = rhs - prior[:free] * (values[texel, :free] - np.array(MEAN)[:free])
         factor = np.linalg.cholesky(normal)
-        half = np.linalg.solve(factor, cross).reshape(-1, 3 * cells)
+        whole = np.zeros((len(texel), free - 3, 3 * cells))
+        for c, block in enumerate(blocks):
+            light = by_light[c][rows]
+            albedo = summed(own[:, c, c, None] * light) / factor[:, c, c, None]
+            schur[block, block] += albedo.T @ albedo
+            for k in range(3, free):
+                whole[:, k - 3, block] = summed(own[:, c, k, None] * light) - factor[:, k, c, None] * albedo
+            rhs_c = rhs[:, c] / factor[:, c, c]
+            slope[block] += albedo.T @ rhs_c
+            rhs[:, 3:] -= factor[:, 3:, c] * rhs_c[:, None]
+        half = np.linalg.solve(factor[:, 3:, 3:], whole).reshape(-1, 3 * cells)
         schur += half.T @ half
-        slope += half.T @ np.linalg.solve(factor, rhs[..., None]).ravel()
+        slope += half.T @ np.linalg.solve(factor[:, 3:, 3:], rhs[:, 3:, None]).ravel()
     return schur, slope
 
 
@@ -264,13 +278,33 @@ def _means(cells: LightCells, target: Float[np.ndarray, "3"]) -> Float[np.ndarra
     return np.kron(np.diag(1 / np.maximum(target, 1e-12)), share)
 
 
-def _least_squares(matrix: np.ndarray, rhs: np.ndarray) -> Radiance:
-    """The x >= 0 that minimises xᵀMx / 2 - xᵀr, as one column per channel."""
-    from scipy.optimize import nnls
+def _least_squares(matrix: np.ndarray, rhs: np.ndarray, near: Radiance) -> Radiance:
+    """The x >= 0 that minimises xᵀMx / 2 - xᵀr, as one column per channel; `near` is a guess.
+
+    Block principal pivoting (Júdice and Pires 1994): the signs of x and of its dual decide which entries are zero. It
+    needs a Cholesky factor per exchange, and few exchanges from a good guess.
+    """
+    from scipy.linalg import cho_factor, cho_solve
 
     size = len(matrix)
     matrix = (matrix + matrix.T) / 2
     level = max(float(np.trace(matrix)) / size, 1e-30)
-    matrix += max(0.0, 1e-7 * level - float(np.linalg.eigvalsh(matrix)[0])) * np.eye(size)
-    factor = np.linalg.cholesky(matrix)
-    return nnls(factor.T, np.linalg.solve(factor, rhs), maxiter=20 * size)[0].reshape(3, -1).T
+    matrix[np.diag_indices(size)] += LEAST_CURVATURE * level
+    free, x, dual = near.T.ravel() > 0, np.zeros(size), -rhs
+    fewest, tries = size + 1, EXCHANGES
+    for _ in range(20 * size):
+        rows = np.flatnonzero(free)
+        x, dual = np.zeros(size), np.zeros(size)
+        x[rows] = cho_solve(cho_factor(matrix[np.ix_(rows, rows)], check_finite=False), rhs[rows], check_finite=False)
+        dual[~free] = (matrix[:, rows] @ x[rows] - rhs)[~free]
+        wrong = np.flatnonzero((free & (x < 0)) | (~free & (dual < -1e-9 * np.abs(rhs).max())))
+        if not len(wrong):
+            break
+        if len(wrong) < fewest:
+            fewest, tries = len(wrong), EXCHANGES
+        elif tries:
+            tries -= 1
+        else:
+            wrong = wrong[-1:]  # Murty's rule: one exchange at a time ends in any case
+        free[wrong] = ~free[wrong]
+    return np.maximum(x, 0).reshape(3, -1).T

@@ -1,13 +1,13 @@
 """The outputs of `mistyle fit` for other programs: the asset, and a Mitsuba scene of it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures
-from mistyle.core.maps import Texels
+from mistyle.core.maps import Maps, Texels
 from mistyle.deliver import asset_files
 from mistyle.jobs.edits import UNEDITED, Edited
 from mistyle.jobs.progress import Report
@@ -19,14 +19,15 @@ def write(
     folder: Path,
     job: Any,
     asset: Asset,
-    texels: Sequence[Texels],
-    recovered: Any,
-    report: Report,
+    sets: Iterable[tuple[Texels, Maps]],
+    report: Report = lambda done: None,
     edited: Edited = UNEDITED,
+    state: str = "",
 ) -> None:
-    """Write the asset; `edited` holds textures that a person painted over."""
+    """Write the asset of texture `sets`; `edited` holds textures that a person painted over, `state` is the share of
+    passes done where some are missing."""
     provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
-    sets = zip(texels, recovered.maps, strict=True)
+    provenance |= {"state": state} if state else {}
     asset_files.write(folder, job, asset, sets, provenance, report, edited, own=BORDER)
 
 

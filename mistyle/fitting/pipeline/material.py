@@ -16,19 +16,19 @@ from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
-from mistyle.core.light import Lights, SceneLights
+from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
+from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
-from mistyle.jobs import checkpoint
 from mistyle.jobs.edits import asset_stage, tell_edits
 from mistyle.jobs.inputs import input_files
-from mistyle.jobs.memory_budget import size_of, with_setting
+from mistyle.jobs.memory_budget import size_of
 from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
@@ -116,14 +116,13 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         if job.lights == "unknown":
             captures = with_light(run, asset, captures)
         fitted, _ = hold_out(captures, s.references)
-        inputs = [s.recover, s.references, s.start, s.seed]
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
-        recovered = run.record(
-            "recover", after, inputs, lambda r: solve(run, asset, texels, subset(captures, fitted), r)
-        )
-        checkpoint.clear(job.out)
+        recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
-        folder, edited = asset_stage(run, ["recover"], lambda f, e, r: write(f, job, asset, texels, recovered, r, e))
+        complete = recovered.passes == recovered.planned
+        state = "" if complete else f"{recovered.passes} of {recovered.planned} passes"
+        sets = list(zip(texels, recovered.maps, strict=True))
+        folder, edited = asset_stage(run, ["recover"], lambda f, e, r: write(f, job, asset, sets, r, e, state))
         tell_edits(run)
         maps = edited(part_stems(job.name, asset.mesh.parts), recovered.maps)[0]
         recovered = replace(recovered, maps=tuple(maps))
@@ -276,38 +275,6 @@ def hold_out(captures: Captures, settings: ReferenceSettings) -> tuple[list[int]
     return fitted, sorted(held)
 
 
-def pixels_of(captures: Captures) -> list[int]:
-    """The number of pixels of each picture."""
-    return [camera.size[0] * camera.size[1] for camera in captures.cameras]
-
-
-def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, report: Report) -> Any:
-    """The fit, with checkpoints in work/ under the stage's key, so that another job's checkpoint is never resumed."""
-    from mistyle.atlas.texels import start_maps
-    from mistyle.solver.recover import Checkpoints, recover
-
-    s: MaterialSettings = run.job.settings
-    start = None
-    if s.start == "own":
-        start = [start_maps(m, t, s.atlas.size) for m, t in zip(asset.materials, texels, strict=True)]
-    folder = checkpoint.place(run.job.out, run.keys["recover"])
-    # The cache of the pictures' samples changes only the time of the fit.
-    unaveraged = with_setting(s, "references.average", 1)  # the pictures are averaged already
-    bounded = check_material(unaveraged, pixels_of(captures), *size_of(asset))
-    return recover(
-        asset.mesh,
-        texels,
-        captures,
-        bounded.recover,
-        s.seed,
-        report,
-        start=start,
-        checkpoints=Checkpoints(
-            save=lambda arrays: checkpoint.save(folder, arrays), resume=checkpoint.load(folder, run.progress.note)
-        ),
-    )
-
-
 def measure(
     asset: Asset, maps: Sequence[Maps], captures: Captures, settings: MaterialSettings, report: Report
 ) -> Measured:
@@ -326,11 +293,10 @@ def measure(
     converted: list[float] = []
     shown_pictures = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
     for k in range(len(captures)):
-        one = subset(captures, [k])
-        rendered = [
-            picture_of(traced, one, sizes, table, model, chosen)
-            for model in ([chosen.model, second_model] if k in shown_pictures else [chosen.model])
-        ]
+        first = renderer_of(traced, subset(captures, [k]), sizes, chosen)
+        rendered = [first.image_and_coverage(table, 0)]
+        if k in shown_pictures:
+            rendered.append(first.with_model(second_model).image_and_coverage(table, 0))
         rgb, valid = captures.load(k)
         valid = valid & (rendered[0][1] > 0.999)
         if valid.any():
@@ -352,9 +318,10 @@ def measure(
     )
 
 
-def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The prediction of the one picture of `captures`, linear, and its coverage."""
+def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any) -> Any:
+    """The renderer of the one picture of `captures`; it keeps the picture's samples."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
-    options = RenderOptions(model, chosen.frame, chosen.subsamples, memory=0)
-    return MaterialRenderer(traced, captures, sizes, options).image_and_coverage(table, 0)
+    subsamples = chosen.soft_subsamples if has_soft(captures.lights) else chosen.subsamples
+    options = RenderOptions(chosen.model, chosen.frame, subsamples, gradients=False)
+    return MaterialRenderer(traced, captures, sizes, options)

@@ -2,76 +2,63 @@
 
 from typing import Any
 
+from mistyle.core.light import has_soft
 from mistyle.fitting.pipeline.budget import (
     COVERED,
     MATERIAL,
-    SEEN,
-    SHOWN,
     averaged_pixels,
     check_material,
     material_counts,
     material_gb,
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.fitting.pipeline.times import closing_stages, recover_seconds
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
-    PER_BOUNCED_PATH,
-    PER_JOINT,
-    PER_LOOK,
-    PER_OBSERVATION,
     PER_READ_PIXEL,
-    PER_SAMPLE_RAY,
-    PER_SMOOTHED,
     PER_TEXEL,
     costs,
     extent_of,
     reading,
 )
+from mistyle.jobs.settings import thread_count
 from mistyle.jobs.stages import claim_run
-from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
+from mistyle.solver.schedule import (
+    FILLED,
+    SHOWN,
+)
+
+LIGHT_SECONDS = 25  # of an unknown light, of few observations whatever the pictures
+PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
 
 
 def plan_material(job: Any) -> dict[str, Any]:
     """The plan of a `MaterialJob`; cameras, lights and pictures' headers are read and refused as the job does.
 
-    The object's share of the pictures is still unknown: fitting/pipeline/budget.py gives typical shares.
+    The object's share of the pictures is still unknown: solver/schedule.py and fitting/pipeline/budget.py give typical
+    shares.
     """
     from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
-    from mistyle.solver.indirect import MOST
-    from mistyle.solver.texels.rounds import STARTS
 
     s, extent = job.settings, extent_of(job.mesh, job.settings)
     claim_run(job, MATERIAL_STAGES, inputs_of(job))
     size = extent.faces, extent.sets, extent.own
-    sizes = pixels_of(references_of(job))
+    captures = references_of(job)
+    sizes = pixels_of(captures)
     texels = extent.sets * s.atlas.size**2
     chosen = check_material(s, sizes, *size)
-    averaged = averaged_pixels(s, sizes)
-    sampled, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
-    solves = s.recover.solver != "pictures"
-    rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
-    begun = solves * (1 + len(estimated[0]))
-    steps, joint = descent_steps(s.recover), joint_steps(s.recover)
-    samples = solves * sum(sum(part) for part in estimated)
-    again = joint_estimates(s.recover)
-    samples += sum(again)
-    paths = samples * sum(min(n, MOST**2) for n in averaged)
-    smoothings = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
-    seconds = {
+    averaged, shown = averaged_pixels(s, sizes), SHOWN if masked(job) else FILLED
+    unknown = job.lights == "unknown"
+    soft = unknown or has_soft(captures.lights)
+    stages = {
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
-        "cameras": 1,
+        "cameras": 1 + PER_ALIGNED * len(sizes),
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        "recover": (rounds + 2 + steps / len(sizes)) * sampled * PER_LOOK
-        + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
-        + paths * PER_BOUNCED_PATH
-        + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
-        + smoothings * COVERED * texels * PER_SMOOTHED,
-        "measure": 2 * sampled * PER_LOOK,
-        "asset": 2 * texels * PER_TEXEL,
-        "scene": 2 * texels * PER_TEXEL,
-        "report": 5 + s.report.frames * s.report.resolution**2 * s.report.spp * PER_SAMPLE_RAY,
+        **({"light": LIGHT_SECONDS} if unknown else {}),
+        "recover": recover_seconds(s, averaged, COVERED * texels, soft, shown),
+        **closing_stages(s, averaged, texels, soft, shown),
     }
     stored = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
     return {
@@ -79,9 +66,26 @@ def plan_material(job: Any) -> dict[str, Any]:
         "references": str(job.references),
         "pictures": len(sizes),
         "megapixels": round(sum(sizes) / 1e6, 1),
-        **costs(job, MATERIAL_STAGES, seconds, extent.sets),
+        **costs(job, MATERIAL_STAGES, _limited(s, stages), extent.sets),
         "memory_gb": material_gb(chosen, sizes, *size),
         "in_files": False,
         "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, *size)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + stored) / 1e9, 2),
     }
+
+
+def masked(job: Any) -> bool:
+    """Whether a picture has a mask or alpha, so that the object is likely to fill less of it."""
+    from mistyle.io.cameras.captures import read_shots
+
+    shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
+    return any(shot.mask is not None or shot.alpha_of is not None for shot in shots)
+
+
+def _limited(settings: Any, stages: dict[str, float]) -> dict[str, float]:
+    """The stages with "recover" ended by `--minutes`, if it would take longer."""
+    if not settings.minutes:
+        return stages
+    threads = thread_count(settings) / 2
+    left = 60 * settings.minutes * threads - sum(v for k, v in stages.items() if k != "recover")
+    return stages | {"recover": min(stages["recover"], max(left, 0))}

@@ -108,6 +108,7 @@ def facts(results: Any) -> tuple[tuple[str, str], ...]:
         ("pictures", str(len(results.captures))),
         ("held out", str(sum(results.measured.held))),
         ("material", results.job.settings.recover.model),
+        ("passes", f"{results.recovered.passes} of {results.recovered.planned}"),
     )
 
 
@@ -227,6 +228,7 @@ def write_summary(results: Any, run: Run) -> dict[str, Any]:
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
         "peaks_gb": merged_peaks(path, run),
         "figures": figures(results),
+        "passes": {"done": results.recovered.passes, "planned": results.recovered.planned},
         "notes": list(run.progress.notes),
     }
     record = summary | {

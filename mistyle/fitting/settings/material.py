@@ -61,6 +61,19 @@ class MaterialSettings(BaseModel):
         "machine's memory, with recover.memory for the pictures' samples",
     )
     threads: int = Field(default=0, ge=0, le=1024, description="threads of the renderer; 0 takes all cores")
+    passes: int = Field(
+        default=0,
+        ge=0,
+        le=10_000,
+        description="end the fit after so many of its passes; 0: all. The same number gives the same bytes",
+    )
+    minutes: float = Field(
+        default=0,
+        ge=0,
+        le=100_000,
+        description="end the fit so that the job takes about so many minutes, after one pass at least; 0: no limit. "
+        "run.json records the passes; a later run with more minutes continues",
+    )
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     start: Literal["nothing", "own"] = Field(
         default="nothing", description="start of the fit: nothing, or the mesh's own material"
@@ -74,4 +87,7 @@ class MaterialSettings(BaseModel):
     colour: ColourSettings = ColourSettings()
 
 
-MATERIAL_PRESETS: dict[str, dict[str, Any]] = {"draft": {"atlas": {"size": 512}}, "standard": {}}
+MATERIAL_PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {"atlas": {"size": 512}, "recover": {"iterations": 240, "bounces": 2, "bounce_samples": 32}},
+    "standard": {},
+}

@@ -146,6 +146,13 @@ class MaterialRenderer:
         twin.options, twin._cache, twin._too_large = replace(self.options, memory=memory), {}, set()
         return twin
 
+    def with_model(self, model: str) -> "MaterialRenderer":
+        """The same renderer, cached samples included, with another reflectance."""
+        twin, o = copy(self), replace(self.options, model=model)
+        twin.options, twin._frozen = o, {}
+        twin._terms = partial(bsdf.terms, bsdf.Reflectance(model, o.flip_invalid, o.shadowing, o.specular))
+        return twin
+
     def image(self, table: Any, picture: int) -> Float[np.ndarray, "h w 3"]:
         """Picture k, linear Rec.709: the mean over all samples of a pixel; samples beside the mesh are black.
 

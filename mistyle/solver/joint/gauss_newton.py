@@ -21,7 +21,7 @@ pictures are slow to render.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,8 +41,11 @@ from mistyle.solver.joint.pixels import (
     indirect_jacobian,
     unknown_frames,
 )
+from mistyle.solver.journal import Journal
+from mistyle.solver.pass_state import PassState
 from mistyle.solver.prior import MARGIN, NOTHING
-from mistyle.solver.settings import RecoverSettings, joint_estimates, joint_steps
+from mistyle.solver.schedule import Pass
+from mistyle.solver.settings import RecoverSettings, joint_steps
 from mistyle.solver.smoothing import LEAST, prior_precision_matrix
 from mistyle.solver.table import Atlas, with_seam_weights
 from mistyle.solver.texels.observations import observation_std
@@ -101,75 +104,89 @@ class JointProblem:
         return [self.direct.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(self.footprints)]
 
 
-def joint_gauss_newton(
-    context: FitContext,
-    renderer: "MaterialRenderer",
-    table: MaterialTable,
-    direct: DirectCaptures,
-    progress: StageProgress,
-) -> tuple[MaterialTable, DirectCaptures]:
-    """`settings.joint` steps from `table` after each of `joint_estimates`, new estimates of indirect light; the second
-    uses the improved maps. Returns the captures with the last estimate too.
+@dataclass(frozen=True)
+class JointSetup:
+    """Geometry that all joint passes share: see `JointProblem`; `axes` are the unknown texels' frames."""
 
-    `renderer` holds no samples; they get the part of `settings.memory` that the steps' arrays leave. Steps that worsen
-    the fit are undone, and steps that exceed the memory are skipped, with a note.
+    renderer: "MaterialRenderer"
+    footprints: Sequence[ImageFootprint]
+    unknown: UnknownTexels
+    axes: Float[np.ndarray, "t 9"]
+
+
+def joint_setup(context: FitContext, renderer: "MaterialRenderer") -> JointSetup | None:
+    """The footprints; None, with a note, where they exceed the memory.
+
+    `renderer` holds no samples; they get the part of `settings.memory` that the steps' arrays leave.
     """
-    settings = context.settings
     footprints = image_footprints(context, renderer)
     if footprints is None:
         context.notes.append(
-            f"The joint steps were skipped: they need more than the {settings.memory:g} GB of "
+            f"The joint steps were skipped: they need more than the {context.settings.memory:g} GB of "
             "recover.memory. Raise it, or use fewer or smaller pictures."
         )
-        return table, direct
+        return None
     pictures, unknown, memory = footprints
-    renderer, axes = renderer.with_memory(memory), unknown_frames(context, unknown)
-    estimates = joint_estimates(settings) or (0,)
-    for number, samples in enumerate(estimates):
-        part = progress.part(number / len(estimates), (number + 1) / len(estimates))
-        reflected = [np.zeros((len(p.index), 3, 3), np.float32) for p in pictures]
-        if samples:
-            sampling = samples, context.seed + (number + 1) * SEED
-            for k, light, vectors in estimate_indirect(
-                context, renderer, table, sampling, part.part(0, 0.5), vectors=True
-            ):
-                assert vectors is not None
-                direct, size = direct.with_indirect(k, light), context.captures.cameras[k].size
-                reflected[k] = indirect_jacobian(pictures[k], light, vectors, size, table[unknown.rows], axes)
-        problem = JointProblem(context, renderer, pictures, unknown, direct, reflected)
-        moved = _steps(problem, table, part.part(0.5, 1))
-        if moved is None:
-            break
-        table = moved
-    return table, direct
+    return JointSetup(renderer.with_memory(memory), pictures, unknown, unknown_frames(context, unknown))
 
 
-def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable | None:
+def joint_pass(
+    context: FitContext, setup: JointSetup, state: PassState, one: Pass, journal: Journal, progress: StageProgress
+) -> PassState:
+    """`settings.joint` steps from the state's table after a new estimate of indirect light.
+
+    Steps that worsen the fit are undone, and no joint pass follows.
+    """
+    table, direct, pictures = state.table, state.direct, setup.footprints
+    assert table is not None
+    reflected = [np.zeros((len(p.index), 3, 3), np.float32) for p in pictures]
+    if one.samples:
+        sampling = one.samples, context.seed + (one.begin + 1) * SEED
+        known = journal.named("light.")
+        # Parts of an interrupted run come first; their cameras are skipped below.
+        for name in known:
+            k, arrays = int(name.split(".")[1]), journal.part(name, dict)
+            direct, reflected[k] = direct.with_indirect(k, arrays["light"]), arrays["reflected"]
+        skip = {int(name.split(".")[1]) for name in known}
+        for k, light, vectors in estimate_indirect(
+            context, setup.renderer, table, sampling, progress.part(0, 0.5), vectors=True, skip=skip
+        ):
+            assert vectors is not None
+            size = context.captures.cameras[k].size
+            reflected[k] = indirect_jacobian(pictures[k], light, vectors, size, table[setup.unknown.rows], setup.axes)
+            direct = direct.with_indirect(k, light)
+            arrays = {"light": light, "reflected": reflected[k]}
+            journal.part(f"light.{k}", lambda arrays=arrays: arrays)
+    problem = JointProblem(context, setup.renderer, pictures, setup.unknown, direct, reflected)
+    moved = _steps(problem, table, journal, progress.part(0.5, 1))
+    return replace(state, direct=direct, table=table if moved is None else moved, over=moved is None)
+
+
+def _steps(
+    problem: JointProblem, table: MaterialTable, journal: Journal, progress: Callable[[float], None]
+) -> MaterialTable | None:
     """All steps after one estimate; None, with a note, if they worsen the fit."""
-    settings, pictures, unknown = problem.context.settings, problem.footprints, problem.unknown
+    settings, unknown = problem.context.settings, problem.unknown
     errors = _residual_stds(problem)
     references = problem.references()
     images = problem.images(table)
-    residuals = _differences(references, images)
-    scale = max(FIT, LOOSE * _robust_std(residuals, errors))
+    scale = max(FIT, LOOSE * _robust_std(_differences(references, images), errors))
     errors = [ResidualStd(e.std * np.float32(scale), e.counts) for e in errors]
-    costs, x = [_cost(residuals, errors)], table
+    costs, x = [_cost(_differences(references, images), errors)], table
     for k in range(settings.joint):
-        derivatives = _derivatives(problem, x, images)
-        for derivative, more in zip(derivatives, problem.reflected, strict=True):
-            derivative[:, :, :3] += more
-        linearised = [
-            LinearisedImage(p.fetch, d, _weights(r, d, e), np.nan_to_num(r))
-            for p, d, r, e in zip(pictures, derivatives, residuals, errors, strict=True)
-        ]
-        progress((k + 0.5) / settings.joint)
-        x = _updated(x, unknown, _step(x, linearised, unknown, problem.context.atlas), settings.roughness_floor)
-        images = problem.images(x)
-        # The indirect light was subtracted for the maps of its estimate.
-        moved = (x - table)[unknown.rows]
-        changed = [indirect_delta(p, more, moved) for p, more in zip(pictures, problem.reflected, strict=True)]
-        residuals = [r - c for r, c in zip(_differences(references, images), changed, strict=True)]
-        costs.append(_cost(residuals, errors))
+
+        def step(x=x, k=k) -> dict[str, np.ndarray]:
+            images = problem.images(x)
+            linearised = _linearised(problem, x, images, (_residuals(problem, references, images, x - table), errors))
+            progress((k + 0.5) / settings.joint)
+            change = _step(x, linearised, unknown, problem.context.atlas)
+            new = _updated(x, unknown, change, settings.roughness_floor)
+            cost = _cost(_residuals(problem, references, problem.images(new), new - table), errors)
+            return {"table": new, "cost": np.array(cost)}
+
+        arrays = journal.part(f"joint{k}", step)
+        x = arrays["table"]
+        costs.append(float(arrays["cost"]))
         progress((k + 1) / settings.joint)
     problem.context.trace.setdefault("joint.cost", []).extend(costs)
     if not costs[-1] < costs[0]:
@@ -178,6 +195,34 @@ def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[floa
         )
         return None
     return x
+
+
+def _residuals(
+    problem: JointProblem, references: Sequence[np.ndarray], images: Sequence[np.ndarray], moved: MaterialTable
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """References less images of maps that have `moved`. The indirect light was subtracted for the maps of its
+    estimate, so its change counts too."""
+    rows, differences = moved[problem.unknown.rows], _differences(references, images)
+    if not moved.any():
+        return differences
+    changed = [indirect_delta(p, m, rows) for p, m in zip(problem.footprints, problem.reflected, strict=True)]
+    return [r - c for r, c in zip(differences, changed, strict=True)]
+
+
+def _linearised(
+    problem: JointProblem,
+    table: MaterialTable,
+    images: Sequence[np.ndarray],
+    errors: tuple[Sequence[np.ndarray], Sequence[ResidualStd]],
+) -> list[LinearisedImage]:
+    """The pictures linearised at `table`; `errors` are residuals and their standard deviations."""
+    derivatives = _derivatives(problem, table, images)
+    for derivative, more in zip(derivatives, problem.reflected, strict=True):
+        derivative[:, :, :3] += more
+    return [
+        LinearisedImage(p.fetch, d, _weights(r, d, e), np.nan_to_num(r))
+        for p, d, r, e in zip(problem.footprints, derivatives, *errors, strict=True)
+    ]
 
 
 def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSettings:

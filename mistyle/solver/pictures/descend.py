@@ -5,9 +5,8 @@ the last ones. Smoothing draws texels that few pictures show, or hardly light, t
 corrects them by the pictures.
 """
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,20 +14,21 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.maps import place_of
 from mistyle.core.stage_progress import StageProgress
-from mistyle.process import stopping
 from mistyle.render.deferred.material_table import COLUMNS, SOLVED, TILT, MaterialTable
-from mistyle.solver.context import DirectCaptures, FitContext
+from mistyle.solver.context import FitContext
+from mistyle.solver.journal import Journal
+from mistyle.solver.pass_state import PassState
 from mistyle.solver.prior import NOTHING
+from mistyle.solver.schedule import JUDGES, Pass
 from mistyle.solver.settings import RecoverSettings, passes
 from mistyle.solver.smoothing import map_smoothing
 from mistyle.solver.table import Atlas, fill
-from mistyle.solver.texels.solve import TexelEstimate, estimate_indirect
+from mistyle.solver.texels.solve import TexelEstimate, journalled_light
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
     from mistyle.solver.pictures.adam import Descent
 
-JUDGES = 48  # pictures whose loss accepts or rejects the steps
 SEEDS = 7907  # seed offset between two estimates; exceeds the number of rounds
 # Factors of the rate by channel after the per-texel solver: albedo is nearly right already, and longer steps would
 # follow the pictures' noise, ...
@@ -44,110 +44,100 @@ UNSOLVED_RATES = (2, 2, 2, 0.2, 0.2, 0.6, 0.6, 0)
 DAMPING = 0.3
 
 
-@dataclass(frozen=True)
-class Checkpoints:
-    """`save` receives the arrays that a later run needs as `resume`, every `settings.checkpoint` seconds.
-
-    Only the steps on whole pictures are saved; earlier stages are computed again.
-    """
-
-    save: Callable[[dict[str, np.ndarray]], None] | None = None
-    resume: dict[str, np.ndarray] | None = None
-
-
-@dataclass(frozen=True)
-class Pass:
-    """The steps `begin` : begin + steps, from the table `base`."""
-
-    base: MaterialTable
-    begin: int
-    steps: int
-
-
-def optimise_on_pictures(
+def picture_pass(
     context: FitContext,
     renderer: "MaterialRenderer",
-    estimate: TexelEstimate,
-    direct: DirectCaptures,
+    state: PassState,
+    one: Pass,
+    journal: Journal,
     progress: StageProgress,
-    checkpoints: Checkpoints,
-) -> tuple[MaterialTable, DirectCaptures]:
-    """The table after all passes from `estimate`, and the captures with the last estimate of their indirect light.
+) -> PassState:
+    """The state after a pass on whole pictures. `renderer` has the references of `state.direct`; those of an estimate
+    of indirect light before the pass replace them."""
+    estimate, direct = state.estimate, state.direct
+    assert estimate is not None
+    base = smoothed(context, state) if one.begin else estimate.table
+    if one.samples:
+        sampling = one.samples, context.seed + SEEDS * (_number(context, one) + 1)
+        for k, light, _ in journalled_light(context, renderer, base, sampling, journal, progress.part(0, 0.4)):
+            direct = direct.with_indirect(k, light)
+            renderer.retarget(direct.direct_only(), direct.pixel_confidence, [k])
+    part = progress.part(0.4, 1) if one.samples else progress
+    table = _descend(context, renderer, estimate, (base, one), part, journal)
+    return replace(state, table=table, direct=direct)
 
-    If the loss does not fall, the table is `estimate`'s own, with a note. A pass that `checkpoints` resume repeats its
-    estimate of indirect light from the same maps.
-    """
-    settings, resume = context.settings, checkpoints.resume
-    parts = passes(settings, len(context.captures)) if estimate.solved else [(settings.iterations, 0)]
-    reached, std = 0 if resume is None else int(resume["iteration"]), _unconstrained_std(estimate)
 
-    def smoothed(table: MaterialTable) -> MaterialTable:
-        if not (estimate.solved and settings.smooth):
-            return table
-        return map_smoothing(table, std, context.atlas, settings.roughness_floor, settings.metallic)
-
-    table, first = estimate.table, 0
-    for number, (steps, samples) in enumerate(parts):
-        last, halfway = first + steps, first + (steps / 2 if samples else 0)
-        if reached < last:
-            going_on = resume if reached > first else None
-            base = going_on["base"] if going_on is not None else smoothed(table) if first else table
-            if samples:
-                sampling = samples, context.seed + SEEDS * (number + 1)
-                part = progress.part(first / settings.iterations, halfway / settings.iterations)
-                for k, light, _ in estimate_indirect(context, renderer, base, sampling, part):
-                    direct = direct.with_indirect(k, light)
-                    renderer.retarget(direct.direct_only(), direct.pixel_confidence, [k])
-            part = progress.part(halfway / settings.iterations, last / settings.iterations)
-            with stopping.at_checkpoints():
-                run = Pass(base, first, steps)
-                table = _descend(context, renderer, estimate, run, part, Checkpoints(checkpoints.save, going_on))
-        first = last
-    before, after = (total_loss(renderer, each, settings) for each in (estimate.table, table))
+def settled(context: FitContext, renderer: "MaterialRenderer", state: PassState) -> PassState:
+    """The state after the last pass on whole pictures, smoothed; the texels' estimate, with a note, if the loss did not
+    fall."""
+    estimate = state.estimate
+    assert estimate is not None and state.table is not None
+    before, after = (total_loss(renderer, each, context.settings) for each in (estimate.table, state.table))
     context.trace["pictures.whole"] = [before, after]
     if not after < before:
         context.notes.append(
             f"The steps on whole pictures were undone: the loss changed from {before:.3g} to {after:.3g}."
         )
-        return estimate.table, direct
-    return smoothed(table), direct
+        return replace(state, table=estimate.table, settled=True)
+    return replace(state, table=smoothed(context, state), settled=True)
+
+
+def smoothed(context: FitContext, state: PassState) -> MaterialTable:
+    """The table of a state between passes on whole pictures, smoothed where the texels were solved."""
+    estimate, settings = state.estimate, context.settings
+    assert estimate is not None and state.table is not None
+    if not (estimate.solved and settings.smooth):
+        return state.table
+    std = _unconstrained_std(estimate)
+    return map_smoothing(state.table, std, context.atlas, settings.roughness_floor, settings.metallic)
+
+
+def _number(context: FitContext, one: Pass) -> int:
+    """The number of a pass among those on whole pictures."""
+    ends = np.cumsum([steps for steps, _ in passes(context.settings, len(context.captures))])
+    return int(np.searchsorted(ends, one.begin, side="right"))
 
 
 def _descend(
     context: FitContext,
     renderer: "MaterialRenderer",
     estimate: TexelEstimate,
-    run: Pass,
+    run: tuple[MaterialTable, Pass],
     progress: Callable[[float], None],
-    checkpoints: Checkpoints,
+    journal: Journal,
 ) -> MaterialTable:
-    """One pass; the rate falls to zero along a cosine."""
+    """The steps of a pass from the table of `run`; the rate falls to zero along a cosine."""
     from mistyle.solver.pictures.adam import table_on_device
 
-    settings, count, resume = context.settings, len(context.captures), checkpoints.resume
+    settings, count, (base, one), resume = context.settings, len(context.captures), run, journal.recall("adam")
     descent = _descent(context, estimate)
-    table, first, pending = table_on_device(run.base), run.begin, []
-    losses = context.trace.setdefault("pictures.loss", [])
+    table, first, pending, own = table_on_device(base), one.begin, [], []
     if resume is not None:
-        first, table = int(resume["iteration"]), table_on_device(resume["table"])
-        losses.extend(resume["losses"].tolist())
+        first, table, own = int(resume["iteration"]), table_on_device(resume["table"]), resume["losses"].tolist()
         descent.restore(resume)
-    saved, end = time.monotonic(), run.begin + run.steps
+
+    def state() -> dict[str, np.ndarray]:
+        flush()
+        return _state(descent, table, done, own)
+
+    def flush() -> None:
+        own.extend(float(np.array(value)[0]) for value in pending)
+        pending.clear()
+
+    done, end = first, one.begin + one.steps
     for k in range(first, end):
         picture = int(np.random.default_rng([context.seed, k // count]).permutation(count)[k % count])
         loss, gradient = renderer.step(table, [picture], settings.loss)
-        rate = settings.rate * 0.5 * (1 + np.cos(np.pi * (k - run.begin) / run.steps))
+        rate = settings.rate * 0.5 * (1 + np.cos(np.pi * (k - one.begin) / one.steps))
         table = descent.step(table, gradient.array, rate, picture)
         pending.append(loss)
-        if (k + 1) % count == 0 or k + 1 == end:
-            losses.extend(float(np.array(value)[0]) for value in pending)
-            pending.clear()
-            progress((k + 1 - run.begin) / run.steps)
-            due = stopping.asked() or time.monotonic() - saved > settings.checkpoint
-            if checkpoints.save is not None and due and k + 1 < end:
-                checkpoints.save(_state(descent, table, run.base, k + 1, losses))
-                saved = time.monotonic()
-                stopping.check()
+        done = k + 1
+        if done % count == 0 or done == end:
+            flush()
+            progress((done - one.begin) / one.steps)
+        if done < end:
+            journal.poll("adam", state)
+    context.trace.setdefault("pictures.loss", []).extend(own)
     _note_stopped(context, descent.stopped())
     return np.array(table).reshape(-1, COLUMNS)
 
@@ -164,11 +154,9 @@ def _descent(context: FitContext, estimate: TexelEstimate) -> "Descent":
     )
 
 
-def _state(
-    descent: "Descent", table: Any, base: MaterialTable, step: int, losses: list[float]
-) -> dict[str, np.ndarray]:
+def _state(descent: "Descent", table: Any, step: int, losses: list[float]) -> dict[str, np.ndarray]:
     """The arrays from which a later run resumes at `step`."""
-    own = {"iteration": np.array(step), "losses": np.array(losses), "base": base}
+    own = {"iteration": np.array(step), "losses": np.array(losses)}
     return descent.state() | own | {"table": np.array(table).reshape(-1, COLUMNS)}
 
 

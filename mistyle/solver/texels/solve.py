@@ -1,6 +1,6 @@
 """The texels' stage of a recovery: observations, solver, rounds and indirect light, at a feasible resolution."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,8 @@ from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import METALLIC, SOLVED, MaterialTable
 from mistyle.solver import prior as recover_prior
 from mistyle.solver.context import DirectCaptures, FitContext, Radiance
-from mistyle.solver.settings import all_rounds, estimates
+from mistyle.solver.journal import Journal
+from mistyle.solver.schedule import SOFT_COST, Pass, rounds_since
 from mistyle.solver.table import PRIOR_MEAN, Atlas, Values, linked, scatter, scatter_to_atlas
 from mistyle.solver.texels import rounds as recover_solve
 from mistyle.solver.texels.levenberg_marquardt import Options, Problem, Solution
@@ -31,7 +32,6 @@ from mistyle.solver.texels.observations import (
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
-SOFT_COST = 64  # approximate run time of a texel under a sky, relative to one light
 INDIRECT_STD = 0.5  # standard deviation of an estimate of indirect light, relative to it
 
 
@@ -54,30 +54,163 @@ class TexelEstimate:
     solved: bool
 
 
-def solve_level(
-    context: FitContext, renderer: "MaterialRenderer", start: Sequence[Maps] | None, progress: StageProgress
-) -> tuple[TexelEstimate, DirectCaptures]:
-    """`solve_texels` on the finest level with at most `solver_texels` texels, upsampled to the atlas.
+@dataclass(frozen=True)
+class TexelLevel:
+    """The per-texel problem on the finest level with at most `solver_texels` texels.
 
-    `renderer` renders tables of the atlas.
+    context   of the level, whose rows and columns are `by` times fewer than the atlas's
+    observed  with the pictures' own radiance and weights
+    start     start values and prior means
+    problem   None where the solver is left out, or has no observation
     """
+
+    context: FitContext
+    renderer: "MaterialRenderer"
+    by: int
+    observed: TexelObservations
+    start: tuple[Values, Values]
+    problem: Problem | None
+
+
+def texel_level(
+    context: FitContext,
+    renderer: Callable[[], "MaterialRenderer"],
+    start: Sequence[Maps] | None,
+    progress: Callable[[float], None],
+) -> TexelLevel:
+    """The level with its observations; `renderer` gives that of the atlas."""
     by, settings, sizes = 1, context.settings, context.atlas.sizes
     sides = [side for size in sizes for side in size]
     most = settings.solver_texels / (SOFT_COST if has_soft(context.captures.lights) else 1)
-    while sum(int(c.sum()) for c in context.atlas.covered) / by**2 > most:
+    while settings.solver != "pictures" and sum(int(c.sum()) for c in context.atlas.covered) / by**2 > most:
         if any(side % (2 * by) or side // (2 * by) < 8 for side in sides):
             break
         by *= 2
-    if by == 1 or settings.solver == "pictures":
-        return solve_texels(context, renderer, start, progress)
+    if by == 1:
+        return _level(context, renderer(), 1, start, progress)
     mesh = context.traced.mesh
     texels = [rasterise(mesh, p, size[0] // by) for p, size in enumerate(sizes)]
     coarse = replace(context, texels=texels, atlas=linked(mesh, texels))
     if start is not None:
         start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
-    estimate, direct = solve_texels(coarse, coarse.renderer(), start, progress)
-    context.notes.append(f"The per-texel solver ran on a level {by} times coarser than the atlas.")
-    return _upsampled(estimate, coarse.atlas, by), direct
+    note = f"The per-texel solver ran on a level {by} times coarser than the atlas."
+    context.notes.extend([note] * (note not in context.notes))
+    # Its texels are larger than pixels, and samples under soft light are slow.
+    subsamples = 1 if has_soft(context.captures.lights) else None
+    return _level(coarse, coarse.renderer(subsamples), by, start, progress)
+
+
+def _level(
+    context: FitContext,
+    renderer: "MaterialRenderer",
+    by: int,
+    start: Sequence[Maps] | None,
+    progress: Callable[[float], None],
+) -> TexelLevel:
+    from mistyle.render.deferred.material_table import pack
+
+    settings = context.settings
+    options = ObservationOptions(settings.facing, settings.noise, settings.relative, settings.solver != "pictures")
+    observed = collect_observations(
+        context.traced, context.texels, context.captures, context.tangents, options, progress
+    )
+    mean = np.tile(np.array(PRIOR_MEAN, np.float32), (len(observed.texel), 1))
+    first = mean.copy() if start is None else pack(start)[observed.texel, SOLVED].copy()
+    mean[:, METALLIC] = first[:, METALLIC]
+    problem = None
+    if settings.solver != "pictures" and len(observed.observations.rgb):
+        chosen = Options(settings.model, settings.metallic, floor=settings.roughness_floor)
+        problem = Problem(observed.points, observed.rig, observed.observations, chosen)
+    elif settings.solver != "pictures":
+        note = "No texel was observed in the light: the per-texel solver was skipped."
+        context.notes.extend([note] * (note not in context.notes))
+    return TexelLevel(context, renderer, by, observed, (first, mean), problem)
+
+
+def first_solution(level: TexelLevel, journal: Journal, progress: Callable[[float], None]) -> Solution:
+    """The texels solved from the start."""
+    problem = level.problem
+    assert problem is not None
+
+    def solve() -> dict[str, np.ndarray]:
+        keep = kept_in(journal, "solve")
+        arguments = problem, level.start, level.observed, level.context.atlas, level.context.settings, progress
+        return dict(vars(recover_solve.first_solve(*arguments, keep)))
+
+    return Solution(**journal.part("solve", solve))
+
+
+def solution_after_rounds(
+    level: TexelLevel,
+    start: tuple[Solution, DirectCaptures],
+    one: Pass,
+    journal: Journal,
+    progress: StageProgress,
+) -> tuple[Solution, DirectCaptures]:
+    """The solution after a pass of rounds from `start`, and the captures with its estimate of indirect light, if any.
+
+    The solver restarts with each estimate: indirect light can shift roughness and metallic into a local minimum, where
+    they would stay otherwise.
+    """
+    (solution, direct), context, problem, atlas = start, level.context, level.problem, level.context.atlas
+    assert problem is not None
+    if one.samples:
+        table = scatter_to_atlas(solution.values, level.observed, atlas)
+        sampling = one.samples, context.seed + one.begin
+        for k, light, _ in journalled_light(context, level.renderer, table, sampling, journal, progress.part(0, 0.4)):
+            direct = direct.with_indirect(k, light)
+    observed = _observed_direct(level.observed, direct) if direct.indirect else level.observed
+    if one.samples:
+        problem.reweight(observed.observations.weight)
+        problem.retarget(observed.observations.rgb)
+        solution = first_solution(level, journal, progress.part(0.4, 0.7))
+    rms = context.trace.setdefault("texels.rms", [])
+    for number in range(one.begin, one.begin + one.steps):
+        name = f"round{number}"
+
+        def solve(solution=solution, number=number, name=name) -> dict[str, np.ndarray]:
+            table = scatter_to_atlas(solution.values, level.observed, atlas)
+            residuals = RoundResiduals(direct, level.renderer, level.renderer.upload(table), [], journal)
+            current = recover_solve.SolverRound(rounds_since(one, number, context.settings), kept_in(journal, name))
+            solved = recover_solve.another_round(
+                problem, observed, atlas, solution, residuals, context.settings, current
+            )
+            return vars(solved) | {"rms": np.array(np.sqrt(np.mean(residuals.squares)))}
+
+        arrays = dict(journal.part(name, solve))
+        rms.append(float(arrays.pop("rms")))
+        solution = Solution(**arrays)
+        progress(0.7 + 0.3 * (number + 1 - one.begin) / one.steps)
+    return solution, direct
+
+
+def estimate_of(level: TexelLevel, solution: Solution | None, context: FitContext) -> TexelEstimate:
+    """The solver's result at the resolution of `context`; that of the start without a solution."""
+    observed, atlas, (first, mean) = level.observed, level.context.atlas, level.start
+    std = np.tile(np.array(recover_prior.PRIOR_SPREAD, np.float32), (len(mean), 1))
+    if solution is None:
+        nothing = np.full(mean.shape, recover_prior.NOTHING, np.float32)
+        estimate = _on_atlas(observed, atlas, (first, std, np.ones(len(mean), np.float32), nothing), False)
+    else:
+        bad = ~np.isfinite(solution.values).all(axis=1, keepdims=True)
+        if bad.any():
+            note = f"{int(bad.sum())} texels were not finite after the per-texel solver and were reset."
+            context.notes.extend([note] * (note not in context.notes))
+        values = np.where(bad, mean, solution.values)
+        std = np.where(bad, std, solution.spread * recover_prior.inflation(solution, observed))
+        weight = recover_prior.data_weight(solution, observed)
+        unconstrained = recover_prior.observation_std(solution, observed, atlas)
+        estimate = _on_atlas(observed, atlas, (values, std, weight, unconstrained), True)
+    return estimate if level.by == 1 else _upsampled(estimate, atlas, level.by)
+
+
+def kept_in(journal: Journal, prefix: str) -> recover_solve.Keep:
+    """Solutions as parts of the journal, named under `prefix`."""
+
+    def keep(name: str, solve: Callable[[], Solution]) -> Solution:
+        return Solution(**journal.part(f"{prefix}.{name}", lambda: dict(vars(solve()))))
+
+    return keep
 
 
 def _upsampled(estimate: TexelEstimate, atlas: Atlas, by: int) -> TexelEstimate:
@@ -109,87 +242,6 @@ def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
     return Maps(known=np.zeros(size, bool), **fields)
 
 
-def solve_texels(
-    context: FitContext, renderer: "MaterialRenderer", start: Sequence[Maps] | None, progress: StageProgress
-) -> tuple[TexelEstimate, DirectCaptures]:
-    """The per-texel solver and its rounds, and the captures with the last estimate of their indirect light.
-
-    The solver restarts with each estimate: indirect light can shift roughness and metallic into a local minimum, where
-    they would stay otherwise.
-    """
-    from mistyle.render.deferred.material_table import pack
-
-    settings, atlas = context.settings, context.atlas
-    options = ObservationOptions(settings.facing, settings.noise, settings.relative, settings.solver != "pictures")
-    observed = collect_observations(
-        context.traced, context.texels, context.captures, context.tangents, options, progress.part(0, 0.3)
-    )
-    mean = np.tile(np.array(PRIOR_MEAN, np.float32), (len(observed.texel), 1))
-    first = mean.copy() if start is None else pack(start)[observed.texel, SOLVED].copy()
-    mean[:, METALLIC] = first[:, METALLIC]
-    std, direct = (
-        np.tile(np.array(recover_prior.PRIOR_SPREAD, np.float32), (len(mean), 1)),
-        DirectCaptures(context.captures),
-    )
-    if settings.solver == "pictures" or not len(observed.observations.rgb):
-        if settings.solver != "pictures":
-            context.notes.append("No texel was observed in the light: the per-texel solver was skipped.")
-        nothing = np.full(mean.shape, recover_prior.NOTHING, np.float32)
-        return _on_atlas(observed, atlas, (first, std, np.ones(len(mean), np.float32), nothing), False), direct
-    problem = Problem(
-        observed.points, observed.rig, observed.observations,
-        Options(settings.model, settings.metallic, floor=settings.roughness_floor),
-    )  # fmt: skip
-
-    def solved_anew(done: Callable[[float], None]) -> Solution:
-        return recover_solve.first_solve(problem, (first, mean), observed.seen, settings, done)
-
-    solution, observed, direct = _rounds(context, renderer, problem, solved_anew, observed, progress)
-    bad = ~np.isfinite(solution.values).all(axis=1, keepdims=True)
-    if bad.any():
-        context.notes.append(f"{int(bad.sum())} texels were not finite after the per-texel solver and were reset.")
-    values = np.where(bad, mean, solution.values)
-    std = np.where(bad, std, solution.spread * recover_prior.inflation(solution, observed))
-    weight = recover_prior.data_weight(solution, observed)
-    unconstrained = recover_prior.observation_std(solution, observed, atlas)
-    return _on_atlas(observed, atlas, (values, std, weight, unconstrained), True), direct
-
-
-def _rounds(
-    context: FitContext,
-    renderer: "MaterialRenderer",
-    problem: Problem,
-    solved_anew: Callable[[Callable[[float], None]], Solution],
-    observed: TexelObservations,
-    progress: StageProgress,
-) -> tuple[Solution, TexelObservations, DirectCaptures]:
-    """The solution after all rounds, and observations and captures after the last estimate of indirect light.
-
-    `solved_anew` solves from the start, first and after each estimate.
-    """
-    settings, atlas, pictures = context.settings, context.atlas, len(context.captures)
-    weight, samples = observed.observations.weight, estimates(settings, pictures)[0]
-    direct = DirectCaptures(context.captures)
-    total, solution = all_rounds(settings, pictures), solved_anew(progress.part(0.3, 0.5))
-    for number in range(total):
-        part = progress.part(0.5 + 0.5 * number / total, 0.5 + 0.5 * (number + 1) / total)
-        table = scatter_to_atlas(solution.values, observed, atlas)
-        if 0 < number <= settings.rounds * len(samples) and number % settings.rounds == 0:
-            sampling = samples[number // settings.rounds - 1], context.seed + number
-            for k, light, _ in estimate_indirect(context, renderer, table, sampling, part.part(0, 0.4)):
-                direct = direct.with_indirect(k, light)
-            observed = _observed_direct(observed, weight, direct)
-            problem.reweight(observed.observations.weight)
-            problem.retarget(observed.observations.rgb)
-            solution = solved_anew(part.part(0.4, 0.8))
-            table = scatter_to_atlas(solution.values, observed, atlas)
-        residuals = RoundResiduals(direct, renderer, renderer.upload(table), [])
-        solution = recover_solve.another_round(problem, observed, atlas, solution, residuals, settings, number)
-        context.trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(residuals.squares))))
-        part(1.0)
-    return solution, observed, direct
-
-
 @dataclass(frozen=True)
 class RoundResiduals:
     """A function of k: reference minus render of picture k, 0 at invalid pixels; `squares` gets its mean square."""
@@ -198,8 +250,10 @@ class RoundResiduals:
     renderer: "MaterialRenderer"
     table: Any
     squares: list[float]
+    journal: Journal
 
     def __call__(self, k: int) -> Float[np.ndarray, "h w 3"]:
+        self.journal.poll()
         rgb, mask = self.direct.load(k)
         residual = np.nan_to_num(rgb) - self.renderer.image(self.table, k)
         residual = np.where(mask[..., None], residual, 0).astype(np.float32)
@@ -230,9 +284,11 @@ def estimate_indirect(
     sampling: tuple[int, int],
     progress: Callable[[float], None],
     vectors: bool = False,
+    skip: Collection[int] = (),
 ) -> Iterator[tuple[int, Radiance, Float[np.ndarray, "h w 9"] | None]]:
     """Each picture's number, its indirect light under the maps of `table`, and with `vectors` its vector irradiance
-    (`Indirect.pictures_and_vectors`); camera by camera. `sampling`: samples a pixel and seed."""
+    (`Indirect.pictures_and_vectors`); camera by camera, without cameras whose pictures are all in `skip`. `sampling`:
+    samples a pixel and seed."""
     from mistyle.render.deferred.material_table import unpack
     from mistyle.solver.indirect import Indirect, in_proportion
 
@@ -240,6 +296,9 @@ def estimate_indirect(
     uploaded, maps = renderer.upload(table), unpack(table, context.atlas.sizes)
     scene = Indirect(context.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for group in by_camera(captures.cameras):
+        done += len(group)
+        if all(k in skip for k in group):
+            continue
         many = [captures.lights[k] for k in group]
         request = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
         lights: list[tuple[np.ndarray, Any]]
@@ -250,18 +309,29 @@ def estimate_indirect(
             rgb, mask = captures.load(k)
             counts = (mask & np.isfinite(rgb).all(axis=-1))[..., None]
             yield k, in_proportion(light, renderer.image(uploaded, k) * counts, np.where(counts, rgb, 0)), vector
-        done += len(group)
         progress(done / len(captures))
 
 
-def _observed_direct(
-    observed: TexelObservations, weight: Float[np.ndarray, " o"], direct: DirectCaptures
-) -> TexelObservations:
-    """The observations without indirect light.
+def journalled_light(
+    context: FitContext,
+    renderer: "MaterialRenderer",
+    table: MaterialTable,
+    sampling: tuple[int, int],
+    journal: Journal,
+    progress: Callable[[float], None],
+) -> Iterator[tuple[int, Radiance, None]]:
+    """`estimate_indirect`, each picture's light a part of the journal."""
+    known = journal.named("light.")
+    done: dict[str, Any] = {"skip": {int(name.split(".")[1]) for name in known}} if known else {}
+    for name in known:
+        yield int(name.split(".")[1]), journal.part(name, dict)["light"], None
+    for k, light, _ in estimate_indirect(context, renderer, table, sampling, progress, **done):
+        yield k, journal.part(f"light.{k}", lambda light=light: {"light": light})["light"], None
 
-    `weight` are weights of the original pictures; the uncertainty of indirect light reduces them.
-    """
-    rgb, weight = observed.observations.rgb.copy(), weight.copy()
+
+def _observed_direct(observed: TexelObservations, direct: DirectCaptures) -> TexelObservations:
+    """The observations without indirect light, whose uncertainty reduces their weights."""
+    rgb, weight = observed.observations.rgb.copy(), observed.observations.weight.copy()
     for k, samples in enumerate(observed.per_image):
         if not len(samples.rows):
             continue

@@ -1,0 +1,42 @@
+"""Seconds of the passes of a fit to pictures and of the stages after them, for the plan and for `--minutes`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from mistyle.core.maps import Texels
+from mistyle.jobs.plan import PER_SAMPLE_RAY, PER_TEXEL
+from mistyle.jobs.settings import thread_count
+from mistyle.solver.schedule import collecting_seconds, finishing_seconds, picture_seconds, schedule, seconds, size_from
+from mistyle.solver.settings import RecoverSettings, joint_steps
+
+PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
+
+
+def recover_seconds(settings: Any, pixels: Sequence[int], covered: float, soft: bool, shown: float) -> float:
+    """Seconds of the passes within `--passes`, and of what precedes and follows them."""
+    chosen: RecoverSettings = settings.recover
+    chosen = chosen.model_copy(update={"joint": 0 if soft else joint_steps(chosen)})
+    size = size_from(chosen, pixels, covered, soft, shown)
+    ordered = schedule(chosen, len(pixels), chosen.solver != "pictures")
+    total = collecting_seconds(chosen, size) + finishing_seconds(chosen, size)
+    return total + sum(seconds(chosen, one, size) for one in ordered[: settings.passes or len(ordered)])
+
+
+def closing_stages(settings: Any, pixels: Sequence[int], texels: float, soft: bool, shown: float) -> dict[str, float]:
+    """Seconds of the stages after "recover"."""
+    report, drawn = settings.report, {"none": 0.0, "page": 0.3, "full": 1.0}[settings.report.detail]
+    return {
+        "measure": 1 + picture_seconds(settings.recover, pixels, soft, shown),
+        "asset": 1 + 4 * texels * PER_TEXEL,
+        "scene": 0.5 + texels * PER_SCENE_TEXEL,
+        "report": drawn * (5 + report.frames * report.resolution**2 * report.spp * PER_SAMPLE_RAY),
+    }
+
+
+def closing_seconds(settings: Any, pixels: Sequence[int], texels: Sequence[Texels], soft: bool, shown: float) -> float:
+    """Seconds between the last pass and the end of a job, on its own threads."""
+    count = sum(t.covered.size for t in texels)
+    covered = sum(int(t.covered.sum()) for t in texels)
+    finishing = finishing_seconds(settings.recover, size_from(settings.recover, pixels, covered, soft, shown))
+    total = finishing + sum(closing_stages(settings, pixels, count, soft, shown).values())
+    return total * 2 / thread_count(settings)

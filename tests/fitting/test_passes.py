@@ -1,0 +1,117 @@
+"""`mistyle fit` that ends after passes, minutes or a stop request, and continues; time left; the plan's stages."""
+
+import hashlib
+import json
+import signal
+
+import pytest
+from test_material import SIDE, SIZE, bowl, one_by_one, orbit
+
+import mistyle
+from mistyle.cli.main import main
+from mistyle.core.errors import Stopped
+from mistyle.fitting.pipeline import passes
+from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.io.read_mesh import read_mesh
+from mistyle.jobs import progress as jobs_progress
+from mistyle.process import stopping
+
+BRIEF = {"iterations": 24, "rounds": 1, "solver_iterations": 6, "bounces": 1, "bounce_samples": 4, "joint": 1}
+SETTINGS = {"recover": BRIEF | {"joint_subsamples": 4}, "report": {"detail": "none"}, "atlas": {"size": SIZE}}
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    """The mesh and eight references."""
+    folder = tmp_path_factory.mktemp("passes")
+    bowl(folder / "bowl.obj")
+    one_by_one(folder / "shots", read_mesh(folder / "bowl.obj", size=SIZE).mesh, orbit(4, 0.55, SIDE // 2))
+    return folder
+
+
+def fit(shots, out, **more):
+    return mistyle.fit(shots / "bowl.obj", shots / "shots", out, **(SETTINGS | more))
+
+
+def hashes(out) -> dict[str, str]:
+    files = sorted(p for p in (out / "asset").rglob("*") if p.is_file() and p.name != "done.json")
+    return {str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="module")
+def whole(shots):
+    summary = fit(shots, shots / "whole")
+    assert summary["passes"]["done"] == summary["passes"]["planned"] > 4
+    return hashes(shots / "whole")
+
+
+def test_passes_are_recorded_and_give_the_same_bytes_again(shots, whole, tmp_path):
+    summary = fit(shots, tmp_path / "minutes", minutes=1e-6)
+    done, planned = summary["passes"]["done"], summary["passes"]["planned"]
+    assert done == 1 and any(f"after 1 of {planned} passes" in note for note in summary["notes"])
+    assert json.loads((tmp_path / "minutes" / "run.json").read_text())["passes"] == summary["passes"]
+    again = fit(shots, tmp_path / "passes", passes=done)
+    assert again["passes"] == summary["passes"]
+    assert hashes(tmp_path / "passes") == hashes(tmp_path / "minutes") != whole
+    assert list((tmp_path / "passes" / "work").glob("checkpoint-*"))
+    more = fit(shots, tmp_path / "passes")
+    assert more["passes"]["done"] == planned and hashes(tmp_path / "passes") == whole
+    assert not list((tmp_path / "passes" / "work").glob("checkpoint-*"))
+
+
+def test_a_stop_request_writes_the_asset_so_far(shots, whole, tmp_path, monkeypatch):
+    write, states = passes.write_preliminary, []
+
+    def asked(run, asset, texels, reached, key):
+        write(run, asset, texels, reached, key)
+        states.append(json.loads((tmp_path / "run.json").read_text()))
+        if len(states) == 1:
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(passes, "write_preliminary", asked)
+    with stopping.listening(), pytest.raises(Stopped, match=r"stopped on request after 1 of \d+ passes; .*asset holds"):
+        fit(shots, tmp_path)
+    assert len(states) == 2 and all(s["finished"] is False and s["passes"]["done"] == 1 for s in states)
+    marker = json.loads((tmp_path / "asset" / "done.json").read_text())
+    assert marker["passes"] == 1 and (tmp_path / "asset" / "bowl.glb").is_file()
+    monkeypatch.setattr(passes, "write_preliminary", write)
+    summary = fit(shots, tmp_path)
+    assert hashes(tmp_path) == whole and summary["passes"]["done"] == summary["passes"]["planned"]
+    assert not any("set aside" in note for note in summary["notes"])
+
+
+def test_the_command_line_takes_both_limits(shots, tmp_path, capsys):
+    words = ["fit", str(shots / "bowl.obj"), str(shots / "shots"), "-o", str(tmp_path / "out"), "--dry-run", "--json"]
+    plans = []
+    for more in ([], ["--passes", "1"], ["--minutes", "1"], ["--light", "unknown"]):
+        assert main([*words, *more]) == 0
+        rows = json.loads(capsys.readouterr().out)["stages"]
+        plans.append({row["stage"]: row["seconds"] for row in rows})
+    assert plans[1]["recover"] < plans[0]["recover"] and sum(plans[2].values()) <= 61
+    assert list(plans[3]) == list(MATERIAL_STAGES) and plans[3]["light"] > 5
+    assert [stage for stage in MATERIAL_STAGES if stage not in plans[0]] == ["light"]
+
+
+def test_the_time_left_grows_by_a_quarter_at_most(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(jobs_progress.time, "perf_counter", lambda: now[0])
+    remaining = jobs_progress.Remaining()
+    assert remaining(0.0) is None
+    left = []
+    for seconds, done in ((10, 0.1), (20, 0.2), (200, 0.21), (400, 0.22), (410, 0.9), (420, 0.99)):
+        now[0] = seconds
+        left.append(remaining(done))
+    assert left[:2] == [pytest.approx(90), pytest.approx(80)]
+    assert all(b <= 1.25 * a + 1e-9 for a, b in zip(left[:-1], left[1:], strict=True))
+    assert left[-1] < 6
+
+
+def test_a_resumed_stage_counts_from_where_it_began(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(jobs_progress.time, "perf_counter", lambda: now[0])
+    lines = []
+    report = jobs_progress._lines("fit the material", lines.append)
+    report.begin_at(0.5)
+    now[0] += 30
+    report(0.6)
+    assert lines == ["  fit the material: 60 %, about 120 s left"]
