@@ -15,6 +15,15 @@ from mistyle.io.meshes.parsed_mesh import Extent
 from mistyle.jobs.inputs import input_files
 from mistyle.jobs.memory_budget import Counts, Need, must_tile, peaks, within_gb
 from mistyle.jobs.settings import thread_count
+from mistyle.solver.settings import (
+    RecoverSettings,
+    all_rounds,
+    descent_steps,
+    estimates,
+    joint_estimates,
+    joint_steps,
+    passes,
+)
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -23,7 +32,8 @@ PER_SURFACE_SAMPLE = 1.3e-4
 PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
-PER_VGG_PIXEL = 7e-6  # of a crop of the finish: twice forward, once back, to relu3_1
+PER_VGG_PIXEL = 3.4e-6  # of a crop in a step of the finish: twice forward, once back, to relu3_1
+PER_PAINTING = 2.0  # the painting's own features, once
 # Fits to pictures:
 PER_READ_PIXEL = 8e-7  # a pixel read and undistorted
 PER_LOOK = 2e-7  # a sample of a pixel, predicted or in a step
@@ -33,6 +43,9 @@ PER_SMOOTHED = 1.5e-5  # a covered texel in one smoothing pass over its neighbou
 PER_JOINT = 1.5e-5  # a pixel that shows the object, in each joint step
 
 PER_TABLE_PIXEL = 4e-8  # of all views, for each texture set that is baked
+
+# The object's share of a picture, the covered share of the atlas, and the share of that which one picture sees.
+SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 
 BYTES_PER_TEXEL = 190
 BYTES_PER_VIEW_PIXEL = 60
@@ -56,6 +69,29 @@ def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size
 def reading(extent: Extent) -> float:
     """Seconds of the stage 'mesh', which reads and unwraps."""
     return 1 + extent.unwrapped * PER_UNWRAPPED_FACE
+
+
+def solving(settings: RecoverSettings, pixels: Sequence[int], texels: int) -> float:
+    """Seconds of the material solver for pictures of `pixels` each and an atlas of `texels`."""
+    from mistyle.solver.indirect import MOST
+    from mistyle.solver.texels.rounds import STARTS
+
+    count = len(pixels)
+    sampled, observed = SHOWN * sum(pixels) * settings.subsamples, COVERED * SEEN * texels * count
+    solves = settings.solver != "pictures"
+    rounds, estimated = solves * all_rounds(settings, count), estimates(settings, count)
+    begun = solves * (1 + len(estimated[0]))
+    steps, joint, again = descent_steps(settings), joint_steps(settings), joint_estimates(settings)
+    samples = solves * sum(sum(part) for part in estimated) + sum(again)
+    paths = samples * sum(min(n, MOST**2) for n in pixels)
+    smoothings = solves * settings.smooth * (1 + (steps > 0) * len(passes(settings, count)))
+    return (
+        (rounds + 2 + steps / count) * sampled * PER_LOOK
+        + (begun * len(STARTS) / 2 + rounds) * settings.solver_iterations * observed * PER_OBSERVATION
+        + paths * PER_BOUNCED_PATH
+        + joint * max(1, len(again)) * SHOWN * sum(pixels) * PER_JOINT
+        + smoothings * COVERED * texels * PER_SMOOTHED
+    )
 
 
 def needed_memory(

@@ -3,10 +3,7 @@
 from typing import Any
 
 from mistyle.fitting.pipeline.budget import (
-    COVERED,
     MATERIAL,
-    SEEN,
-    SHOWN,
     averaged_pixels,
     check_material,
     material_counts,
@@ -16,20 +13,17 @@ from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
-    PER_BOUNCED_PATH,
-    PER_JOINT,
     PER_LOOK,
-    PER_OBSERVATION,
     PER_READ_PIXEL,
     PER_SAMPLE_RAY,
-    PER_SMOOTHED,
     PER_TEXEL,
+    SHOWN,
     costs,
     extent_of,
     reading,
+    solving,
 )
 from mistyle.jobs.stages import claim_run
-from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
 
 def plan_material(job: Any) -> dict[str, Any]:
@@ -38,8 +32,6 @@ def plan_material(job: Any) -> dict[str, Any]:
     The object's share of the pictures is still unknown: fitting/pipeline/budget.py gives typical shares.
     """
     from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
-    from mistyle.solver.indirect import MOST
-    from mistyle.solver.texels.rounds import STARTS
 
     s, extent = job.settings, extent_of(job.mesh, job.settings)
     claim_run(job, MATERIAL_STAGES, inputs_of(job))
@@ -48,27 +40,13 @@ def plan_material(job: Any) -> dict[str, Any]:
     texels = extent.sets * s.atlas.size**2
     chosen = check_material(s, sizes, *size)
     averaged = averaged_pixels(s, sizes)
-    sampled, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
-    solves = s.recover.solver != "pictures"
-    rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
-    begun = solves * (1 + len(estimated[0]))
-    steps, joint = descent_steps(s.recover), joint_steps(s.recover)
-    samples = solves * sum(sum(part) for part in estimated)
-    again = joint_estimates(s.recover)
-    samples += sum(again)
-    paths = samples * sum(min(n, MOST**2) for n in averaged)
-    smoothings = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        "recover": (rounds + 2 + steps / len(sizes)) * sampled * PER_LOOK
-        + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
-        + paths * PER_BOUNCED_PATH
-        + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
-        + smoothings * COVERED * texels * PER_SMOOTHED,
-        "measure": 2 * sampled * PER_LOOK,
+        "recover": solving(s.recover, averaged, texels),
+        "measure": 2 * SHOWN * sum(averaged) * s.recover.subsamples * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,
         "scene": 2 * texels * PER_TEXEL,
         "report": 5 + s.report.frames * s.report.resolution**2 * s.report.spp * PER_SAMPLE_RAY,
