@@ -23,7 +23,8 @@ PER_SURFACE_SAMPLE = 1.3e-4
 PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
-PER_VGG_PIXEL = 7e-6  # of a crop of the finish: twice forward, once back, to relu3_1
+PER_VGG_PIXEL = 3.4e-6  # of a crop in a step of the finish: twice forward, once back, to relu3_1
+PER_PAINTING = 2.0  # the painting's own features, once
 # Fits to pictures:
 PER_READ_PIXEL = 8e-7  # a pixel read and undistorted
 

@@ -22,7 +22,8 @@ STARTS, RESTARTED, CONTINUED = 3, 37, 5  # starts of a solve; steps of a round w
 SOFT_COST = 16  # approximate run time of a texel under a sky, relative to one light
 SKY_CELLS = 128
 MOST = 512  # pixels along the longer side of an estimate of indirect light
-SHOWN, SEEN = 0.3, 0.35  # the object's share of a picture, and the share of its covered texels that a picture sees
+# The object's share of a picture, the covered share of the atlas, and the share of that which one picture sees.
+SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 FILLED = 0.55  # the object's share of its bounding box in a picture, or of a picture without alpha or mask
 JUDGES = 48  # pictures whose loss accepts or rejects the steps on whole pictures
 RESTARTS = 3  # rounds in which texels also start from their neighbours' values
@@ -165,6 +166,13 @@ def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     elif one.kind == "polish":
         total += one.steps * size.samples / size.pictures * 20 * PER_PATH
     return total
+
+
+def whole_seconds(settings: RecoverSettings, size: Size, count: int | None = None) -> float:
+    """Seconds of a recovery, of its first `count` passes where given."""
+    ordered = schedule(settings, size.pictures, settings.solver != "pictures")[:count]
+    total = collecting_seconds(settings, size) + finishing_seconds(settings, size)
+    return total + sum(seconds(settings, one, size) for one in ordered)
 
 
 def shares(settings: RecoverSettings, ordered: Sequence[Pass], size: Size) -> list[float]:

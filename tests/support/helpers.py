@@ -15,7 +15,15 @@ def fixed_surface(**changes: Any) -> Any:
     from mistyle.stylization.surface.exemplar.chosen import resolved
     from mistyle.stylization.surface.settings import SurfaceSettings
 
-    fixed = {"levels": 5, "detail": 4.0, "palette": 0.2, "stroke_coherence": 0.03, "modelling": 0.0, "crop": 0.0}
+    fixed = {
+        "levels": 5,
+        "detail": 4.0,
+        "palette": 0.2,
+        "stroke_coherence": 0.03,
+        "modelling": 0.0,
+        "crop": 0.0,
+        "omit": (),
+    }
     return resolved(SurfaceSettings(**(fixed | {"look_up": "bilinear", "borders": "blend"} | changes)), None)
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
+from mistyle.jobs.plan import COVERED, SEEN, SHOWN
 from mistyle.solver.settings import joint_steps
 
 # A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not
@@ -22,8 +23,6 @@ MATERIAL = {
 }
 MATERIAL = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in MATERIAL.items()}
 KEEPING = ("recover", "measure", "asset", "scene", "report")
-# The object's share of a picture, the covered share of the atlas, and the share of that which one picture sees.
-SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 SAMPLE = 32  # cached bytes per sample of a picture
 # The settings that save memory when halved.
 FITTED = ("atlas.size", "recover.subsamples")

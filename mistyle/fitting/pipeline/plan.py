@@ -4,7 +4,6 @@ from typing import Any
 
 from mistyle.core.light import has_soft
 from mistyle.fitting.pipeline.budget import (
-    COVERED,
     MATERIAL,
     averaged_pixels,
     check_material,
@@ -24,10 +23,7 @@ from mistyle.jobs.plan import (
 )
 from mistyle.jobs.settings import thread_count
 from mistyle.jobs.stages import claim_run
-from mistyle.solver.schedule import (
-    FILLED,
-    SHOWN,
-)
+from mistyle.solver.schedule import COVERED, FILLED, SHOWN
 
 LIGHT_SECONDS = 25  # of an unknown light, of few observations whatever the pictures
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked

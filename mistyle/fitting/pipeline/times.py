@@ -6,7 +6,7 @@ from typing import Any
 from mistyle.core.maps import Texels
 from mistyle.jobs.plan import PER_SAMPLE_RAY, PER_TEXEL
 from mistyle.jobs.settings import thread_count
-from mistyle.solver.schedule import collecting_seconds, finishing_seconds, picture_seconds, schedule, seconds, size_from
+from mistyle.solver.schedule import finishing_seconds, picture_seconds, size_from, whole_seconds
 from mistyle.solver.settings import RecoverSettings, joint_steps
 
 PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
@@ -16,10 +16,7 @@ def recover_seconds(settings: Any, pixels: Sequence[int], covered: float, soft: 
     """Seconds of the passes within `--passes`, and of what precedes and follows them."""
     chosen: RecoverSettings = settings.recover
     chosen = chosen.model_copy(update={"joint": 0 if soft else joint_steps(chosen)})
-    size = size_from(chosen, pixels, covered, soft, shown)
-    ordered = schedule(chosen, len(pixels), chosen.solver != "pictures")
-    total = collecting_seconds(chosen, size) + finishing_seconds(chosen, size)
-    return total + sum(seconds(chosen, one, size) for one in ordered[: settings.passes or len(ordered)])
+    return whole_seconds(chosen, size_from(chosen, pixels, covered, soft, shown), settings.passes or None)
 
 
 def closing_stages(settings: Any, pixels: Sequence[int], texels: float, soft: bool, shown: float) -> dict[str, float]:

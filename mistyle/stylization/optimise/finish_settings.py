@@ -6,6 +6,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 JUDGED = 3  # batches of held-out crops that compare before and after
+JUDGING = 0.4  # cost of such a batch, in steps: nothing is differentiated
 
 
 class FinishSettings(BaseModel):

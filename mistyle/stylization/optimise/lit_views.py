@@ -22,14 +22,12 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.solver.recover import Recovered, recover
-from mistyle.solver.settings import RecoverSettings
 from mistyle.stylization.mvst.unlight import BOUND, LEAST, STROKE, blurred
-from mistyle.stylization.optimise.settings import FitSettings
+from mistyle.stylization.optimise.settings import FitSettings, lit_solver
 from mistyle.stylization.optimise.table import ROUGHNESS_FLOOR
 from mistyle.stylization.optimise.two_phase import Fit, FitStart, FitTargets, shrinkage, two_phase, view_mask
 
-# Stylized views are not measurements: fewer steps and samples than for photographs.
-ITERATIONS, BOUNCES, BOUNCE_SAMPLES, JOINT_SAMPLES, SUBSAMPLES = 640, 2, 32, 9, 4
+SUBSAMPLES = 4  # of a pixel, in residuals
 SOLVED_SHARE = 0.8  # share of the total progress
 LEAST_Z = 0.3  # of a normal: 72 degrees from the surface normal
 DESCRIBED = ("normal", "roughness", "albedo", "metallic")
@@ -122,12 +120,7 @@ def solve(
     coarse = [t if by == 1 else rasterise(mesh, k, len(t.covered) // by) for k, t in enumerate(texels)]
     start = [_shrunk(m, t.covered.shape) for m, t in zip(maps, coarse, strict=True)]
     targets, captures = lit.views, lit.captures()
-    # Under soft light, steps on whole pictures took as long as the texels and were undone.
-    chosen = RecoverSettings(
-        solver="texels" if has_soft(captures.lights) else "both",
-        metallic=settings.metallic == "fit", iterations=ITERATIONS, bounces=BOUNCES, bounce_samples=BOUNCE_SAMPLES,
-        joint_subsamples=JOINT_SAMPLES,
-    )  # fmt: skip
+    chosen = lit_solver(settings, has_soft(captures.lights))
     recovered = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
     fitted = tuple(_where_seen(recovered, start, coarse, k) for k in range(len(start)))
     residual, unlit = _explained(mesh, captures, (start, fitted), targets)

@@ -5,6 +5,11 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mistyle.solver.settings import RecoverSettings
+
+# Of the solver of lit views. Stylized views are not measurements: fewer steps and samples than for photographs.
+ITERATIONS, BOUNCES, BOUNCE_SAMPLES, JOINT_SAMPLES = 640, 2, 32, 9
+
 
 class FitSettings(BaseModel):
     """Settings of the fit: the paper's values (4.2) where given, else values measured on real data."""
@@ -110,4 +115,17 @@ class FitSettings(BaseModel):
     )
     struggle_window: int = Field(
         default=100, ge=1, description="last steps whose albedo gradient is accumulated (the paper's 100)"
+    )
+
+
+def lit_solver(settings: FitSettings, soft: bool) -> RecoverSettings:
+    """The material solver's settings for stylized views under known light, which may be `soft`."""
+    return RecoverSettings(
+        # Under soft light, steps on whole pictures took as long as the texels and were undone.
+        solver="texels" if soft else "both",
+        metallic=settings.metallic == "fit",
+        iterations=ITERATIONS,
+        bounces=BOUNCES,
+        bounce_samples=BOUNCE_SAMPLES,
+        joint_subsamples=JOINT_SAMPLES,
     )

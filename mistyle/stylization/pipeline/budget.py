@@ -70,11 +70,15 @@ DRAWN = ("rig.resolution", "draw.spp")
 BAKED = ("atlas.size",)
 
 
-def view_pixels(settings: Settings) -> int:
-    """Pixels of all views; an upper estimate of 16 views for rigs from a file or from next-best-view selection."""
+def view_count(settings: Settings) -> int:
+    """Number of views; an upper estimate of 16 for rigs from a file or from next-best-view selection."""
     rig = settings.rig
-    views = {"paper": 16, "turntable": rig.views, "nbv": min(16, rig.most_views)}.get(rig.kind, 16)
-    return views * rig.resolution**2
+    return {"paper": 16, "turntable": rig.views, "nbv": min(16, rig.most_views)}.get(rig.kind, 16)
+
+
+def view_pixels(settings: Settings) -> int:
+    """Pixels of all views."""
+    return view_count(settings) * settings.rig.resolution**2
 
 
 def counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> Counts:

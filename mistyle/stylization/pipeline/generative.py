@@ -41,6 +41,11 @@ def fit_settings(settings: Settings) -> FitSettings:
     )
 
 
+def solves_lit(chosen: FitSettings) -> bool:
+    """Whether lit views are solved for before the phases; `chosen` are the `fit_settings`."""
+    return chosen.painted == "with-light" and chosen.solve and chosen.refine == "all" and chosen.iterations1 > 0
+
+
 def lights_of_views(settings: Settings) -> Lights | None:
     """The lights under which the views are drawn; None where only the user's own scene file describes them."""
     from mistyle.core.paths import scenes

@@ -1,5 +1,6 @@
 """Stages, time and disk estimates of `stylize`, `render` and `bake` (`--dry-run`); see jobs/plan.py."""
 
+from math import ceil, log2
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
     BYTES_PER_VIEW_PIXEL,
     PER_CROP_PIXEL,
+    PER_PAINTING,
     PER_SAMPLE_RAY,
     PER_SURFACE_SAMPLE,
     PER_TABLE_PIXEL,
@@ -21,6 +23,8 @@ from mistyle.jobs.plan import (
     reading,
 )
 from mistyle.jobs.stages import claim_run
+from mistyle.solver.schedule import COVERED, SHOWN, size_from, whole_seconds
+from mistyle.stylization.optimise.settings import lit_solver
 from mistyle.stylization.pipeline.budget import (
     BAKE,
     BAKE_TILED,
@@ -34,6 +38,7 @@ from mistyle.stylization.pipeline.budget import (
     bake_counts,
     counts,
     render_counts,
+    view_count,
     view_pixels,
 )
 from mistyle.stylization.pipeline.job import FINISH, STAGES, Job
@@ -54,7 +59,10 @@ def plan(job: Job) -> dict[str, Any]:
     s = job.settings
     pixels = view_pixels(s)
     texels = extent.sets * s.atlas.size**2
-    crops = fit_steps(s) * s.fit.crops
+    solve = _solving(s, texels)
+    # The solve of lit views replaces phase 1.
+    steps = fit_steps(s) - (s.fit.iterations1 if solve else 0)
+    crops = steps * s.fit.crops
     repaired = not s.keeps_painting
     frames = s.report.frames * s.report.resolution**2 * s.report.spp
     seconds = {
@@ -65,7 +73,7 @@ def plan(job: Job) -> dict[str, Any]:
         "bake": 2 * texels * PER_TEXEL + pixels * PER_VIEW_PIXEL,
         **_finishing(s),
         "stylized": 2 * pixels * PER_VIEW_PIXEL,
-        "fit": crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
+        "fit": solve + crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
         "masks": repaired * 0.3 * texels * PER_TEXEL,
         "repair": repaired * texels * PER_TEXEL + 0.1 * crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
         "asset": 2 * texels * PER_TEXEL,
@@ -134,11 +142,30 @@ def plan_bake(mesh: Path, views: Path, out: Path, settings: Settings, name: str)
     }
 
 
+def _solving(settings: Settings, texels: int) -> float:
+    """Seconds of the solve of lit views, on texels as large as the views resolve (optimise/two_phase.py, shrinkage);
+    0 where none are solved for."""
+    from mistyle.core.light import has_soft
+    from mistyle.stylization.pipeline.generative import fit_settings, lights_of_views, solves_lit
+
+    lit = lights_of_views(settings) if solves_lit(fit_settings(settings)) else None
+    if lit is None:
+        return 0.0
+    shown = settings.rig.resolution**2
+    # A surface's mean projection is a quarter of its area (Cauchy).
+    density = COVERED * texels / (4 * SHOWN * shown)
+    by = 2 ** max(ceil(log2(density**0.5 / settings.fit.texels_per_pixel)), 0)
+    solver, soft = lit_solver(settings.fit, has_soft([lit])), has_soft([lit])
+    size = size_from(solver, [shown] * view_count(settings), COVERED * texels / by**2, soft)
+    return whole_seconds(solver, size)
+
+
 def _finishing(settings: Settings) -> dict[str, float]:
     """Seconds of the stage 'finish', if enabled, with its evaluation crops before and after."""
-    from mistyle.stylization.optimise.finish_settings import JUDGED
+    from mistyle.stylization.optimise.finish_settings import JUDGED, JUDGING
 
     chosen = settings.finish
     if chosen.method == "off":
         return {}
-    return {"finish": (chosen.steps + 2 * JUDGED) * chosen.crops * chosen.crop_size**2 * PER_VGG_PIXEL}
+    steps = chosen.steps + JUDGING * 2 * JUDGED
+    return {"finish": PER_PAINTING + steps * chosen.crops * chosen.crop_size**2 * PER_VGG_PIXEL}

@@ -34,6 +34,7 @@ from mistyle.stylization.pipeline.generative import (
     lights_of_views,
     opaque,
     release,
+    solves_lit,
     texture_inpainter,
 )
 from mistyle.stylization.pipeline.job import EVERY_STAGE, REFINING, STAGES, Job
@@ -266,7 +267,7 @@ def fit(
 
     chosen, seed = fit_settings(settings), settings.seed
     where, look = atlas.texels, opaque(style) if settings.fit.tv_from == "style" else None
-    solving = chosen.painted == "with-light" and chosen.solve and chosen.refine == "all" and chosen.iterations1 > 0
+    solving = solves_lit(chosen)
     lit = lights_of_views(settings) if solving else None
     if lit is not None:
         return lit_phases(asset.mesh, baked.maps, stylized, where, lit, chosen, seed, report, style=look)

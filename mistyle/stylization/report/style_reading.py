@@ -76,6 +76,7 @@ def choices(one: StyleLook) -> str:
     """The settings derived from a picture, and those the user set."""
     shown = {name: getattr(one.settings, name) for name in FROM_PAINTING}
     shown["crop"] = "/".join(f"{share:.3f}" for share in one.settings.crop)
+    shown["omit"] = "; ".join("/".join(f"{edge:.2f}" for edge in box) for box in one.settings.omit) or "nothing"
     chosen = [f"{name} {value}" for name, value in shown.items() if name in one.chosen]
     fixed = [f"{name} {value} (set)" for name, value in shown.items() if name not in one.chosen]
     return ", ".join(chosen + fixed)

@@ -90,6 +90,8 @@ LookUp = Literal["nearest", "bilinear"]
 Borders = Literal["cut", "blend"]
 Share = Annotated[float, Field(ge=0.0, le=0.4)]
 Crop = Share | tuple[Share, Share, Share, Share]
+Place = Annotated[float, Field(ge=0.0, le=1.0)]
+Boxes = tuple[tuple[Place, Place, Place, Place], ...]
 
 
 class SurfaceSettings(PlainSettings):
@@ -137,6 +139,11 @@ class SurfaceSettings(PlainSettings):
         description="share of the picture left out along each border (frames, paper), or four of them: top, left, "
         "bottom, right; unset: the detected borders",
     )
+    omit: Boxes | None = Field(
+        default=None,
+        description="boxes of the picture that are not copied: top, left, bottom, right, in shares of its height and "
+        "width; unset: detected titles, signatures and cartouches; [] copies everything",
+    )
 
 
 class ResolvedSettings(PlainSettings):
@@ -150,6 +157,7 @@ class ResolvedSettings(PlainSettings):
     look_up: LookUp
     borders: Borders
     crop: tuple[Share, Share, Share, Share]
+    omit: Boxes
 
 
 class PaintSettings(BaseModel):

@@ -142,7 +142,8 @@ def mesh_guides(
 ) -> MeshGuides:
     """Samples of the mesh and their guides; unset settings are derived from the picture."""
     resolved = settled(picture.rgb, picture.alpha, settings)
-    prepared = style.prepare(picture.rgb, resolved.crop, picture.alpha)
+    alpha = style.without(picture.alpha, picture.rgb.shape, resolved.omit)
+    prepared = style.prepare(picture.rgb, resolved.crop, alpha)
     levels = hierarchy(mesh, resolved, seed, dj, progress, fields.direction)
     rng = np.random.default_rng([seed, 2])
     palette = style.palette(prepared, resolved.liveliness, rng, resolved.palette_mix)

@@ -103,6 +103,38 @@ def test_strokes_and_shapes_are_no_tiles(picture):
     assert read_style(picture).tiled < 0.12
 
 
+def lettered(left, base, ink=0.1, ground=0.8):
+    """Brushwork with a calm part, and a word on it; and the word's pixels."""
+    picture, word = (255 * noise((768, 1024), 4.0)).astype(np.uint8), np.zeros((768, 1024), np.uint8)
+    picture[base - 60 : base + 40, left - 20 : left + 240] = 255 * ground
+    cv2.putText(word, "NAME 1913", (left, base), cv2.FONT_HERSHEY_SIMPLEX, 0.9, 255, 2, cv2.LINE_AA)
+    share = word[..., None] / np.float32(255)
+    return (picture / np.float32(255)) * (1 - share) + ink * share, word > 40
+
+
+@pytest.mark.parametrize("place", [(40, 70), (740, 720), (40, 70, 0.9, 0.3)])
+def test_words_on_calm_ground_near_the_edge_are_not_copied(place):
+    """The box holds the word and little more; what it leaves of the picture has no ink."""
+    picture, word = lettered(*place)
+    reading = read_style(picture)
+    (box,) = reading.lettering
+    rows, columns = np.nonzero(word)
+    top, left, bottom, right = box[0] * 768, box[1] * 1024, box[2] * 768, box[3] * 1024
+    assert top <= rows.min() and rows.max() < bottom and left <= columns.min() and columns.max() < right
+    assert (bottom - top) * (right - left) < 3 * np.ptp(rows) * np.ptp(columns)
+    made = resolved(SurfaceSettings(), reading)
+    alpha = style.without(None, picture.shape, made.omit)
+    assert alpha is not None and not alpha[word].any() and alpha.mean() > 0.97
+    ground = 0.8 if len(place) == 2 else place[3]
+    assert np.abs(style.prepare(picture, alpha=alpha).rgb[word] - ground).max() < 0.02
+    assert resolved(SurfaceSettings(omit=()), reading).omit == ()
+
+
+@pytest.mark.parametrize("picture", [noise(), oil(), shapes(), tiles(32), bent(16), stripes(30), art((3, 3))])
+def test_what_has_no_lettering_is_copied_whole(picture):
+    assert read_style(picture).lettering == ()
+
+
 @pytest.mark.parametrize("period", [16, 32, 64])
 def test_the_unit_is_the_period_of_tiles(period):
     reading = read_style(tiles(period))
@@ -224,8 +256,9 @@ REAL = {
     "mosaic_ducks.jpg": lambda r: 0.02 < r.unit < 0.06 and graphic(r) > 0.8,
     "pixelart_rpg_urban.png": lambda r: r.pixel_grid == (1, 1) and abs(r.unit * 432 - 16) < 2,
     "woodcut_head.jpg": lambda r: r.tones == 2 and flat(r) == 1,
-    "great_wave.jpg": lambda r: r.flatness > 0.2 and graphic(r) == 1,
-    "starry_night.jpg": lambda r: flat(r) < 0.1 and graphic(r) < 0.3 and r.tones > 3,
+    "great_wave.jpg": lambda r: r.flatness > 0.2 and graphic(r) == 1 and len(r.lettering) == 1,
+    "starry_night.jpg": lambda r: flat(r) < 0.1 and graphic(r) < 0.3 and r.tones > 3 and r.lettering == (),
+    "udnie.jpg": lambda r: len(r.lettering) == 2,
     "shipwreck_minotaur.jpg": lambda r: graphic(r) < 0.5,
 }
 

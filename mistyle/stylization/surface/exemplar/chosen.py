@@ -6,7 +6,7 @@ from jaxtyping import Float
 from mistyle.stylization.surface.exemplar.reading import StyleReading, read_style
 from mistyle.stylization.surface.settings import ResolvedSettings, SurfaceSettings
 
-FROM_PAINTING = ("levels", "detail", "palette", "stroke_coherence", "modelling", "look_up", "borders", "crop")
+FROM_PAINTING = ("levels", "detail", "palette", "stroke_coherence", "modelling", "look_up", "borders", "crop", "omit")
 FLAT_SHARE = 0.2  # share of flat area at which `flat` reaches 1
 FEW_TONES = 2
 LINED = (0.6, 0.75)  # line-likeness at which its term of `graphic` is 0 and 1
@@ -48,6 +48,7 @@ def from_painting(reading: StyleReading) -> dict[str, object]:
         "look_up": "nearest" if min(reading.pixel_grid) > 0 else "bilinear",
         "borders": "cut" if share >= GRAPHIC else "blend",
         "crop": reading.border,
+        "omit": reading.lettering,
     }
 
 

@@ -1,5 +1,6 @@
 """Exemplar of the synthesis: the painting in four quarter turns, each pixel with colour, patch and guides."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,6 +21,7 @@ PALETTE_COLOURS = 20_000
 TWO_TONED = 0.95  # between-class share of the variance of lightness from which a painting has two tones only
 RARITY_CELL = 0.05  # Lab / 100
 Crop = tuple[float, float, float, float]  # top, left, bottom, right, in shares of the height or width
+Box = tuple[float, float, float, float]  # top, left, bottom, right, in shares of the height or width
 UNCROPPED: Crop = (0.0, 0.0, 0.0, 0.0)
 RAREST = 0.01  # share of the most common colour's pixels below which rarity does not grow
 
@@ -118,6 +120,20 @@ def prepare(
             picture = np.concatenate([picture, np.flip(picture, axis)], axis=axis)
             opaque = np.concatenate([opaque, np.flip(opaque, axis)], axis=axis)
     return StyleImage(np.ascontiguousarray(picture), opaque)
+
+
+def without(
+    alpha: Float[np.ndarray, "h w"] | None, shape: tuple[int, ...], boxes: Sequence[Box]
+) -> Float[np.ndarray, "h w"] | None:
+    """The alpha of a picture of `shape` with `boxes` transparent."""
+    if not boxes:
+        return alpha
+    height, width = shape[:2]
+    left_out = np.ones((height, width), np.float32) if alpha is None else alpha.copy()
+    for top, left, bottom, right in boxes:
+        rows = slice(int(top * height), int(np.ceil(bottom * height)))
+        left_out[rows, int(left * width) : int(np.ceil(right * width))] = 0
+    return left_out
 
 
 def long_side(shape: tuple[int, ...], long: float) -> tuple[int, int]:

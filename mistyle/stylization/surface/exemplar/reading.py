@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.stylization.surface.exemplar import edges
 from mistyle.stylization.surface.exemplar import exemplar as style
+from mistyle.stylization.surface.exemplar.lettering import lettering
 
 LONG = 512  # pixels along the longer side for most measures
 FINE = 1.0  # pixels of blur before local differences, against noise of paper, canvas and JPEG
@@ -55,8 +56,7 @@ class StyleReading:
     rectilinear   share of the contrast along two axes at right angles
     tiled         share of the area between thin lines that lies in closed, compact cells of one size
     border        border outside the picture (top, left, bottom, right), shares of the height or width
-
-    Lettering, cartouches and signatures are not detected: `paint.style_mask` excludes them.
+    lettering     boxes of titles, signatures and cartouches (top, left, bottom, right), the same shares
     """
 
     unit: float
@@ -69,6 +69,7 @@ class StyleReading:
     rectilinear: float
     tiled: float
     border: style.Crop
+    lettering: tuple[style.Box, ...]
 
 
 def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] | None = None) -> StyleReading:
@@ -100,6 +101,7 @@ def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] 
         rectilinear=rectilinear,
         tiled=tiled(style.lab_from_srgb(style.resized(art, finer))[..., 0]),
         border=border,
+        lettering=lettering(picture, border) if grid == (0, 0) and opaque.all() else (),
     )
 
 
