@@ -36,6 +36,7 @@ OPTIONS = {
     "refine_poses": "references.refine_poses",
     "hold_out": "references.hold_out",
     "hold_out_light": "references.hold_out_light",
+    "photometry": "photometry.mode",
     "material": "recover.model",
     "frame": "recover.frame",
     "metallic": "recover.metallic",
@@ -93,6 +94,12 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     group.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
     group.add_argument(
         "--pictures", type=Path, metavar="DIR", help="folder of the pictures (default: the paths in the cameras' file)"
+    )
+    group.add_argument(
+        "--photometry",
+        choices=["none", "exposure", "full"],
+        help="solve for exposures, or also white balance, vignetting and veiling light (default: full under unknown "
+        "light for 8-bit pictures without --exposure)",
     )
     group.add_argument(
         "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"

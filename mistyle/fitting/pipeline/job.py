@@ -10,6 +10,7 @@ MATERIAL_STAGES = {
     "mesh": "read the mesh",
     "texels": "rasterise the UVs",
     "cameras": "place the cameras",
+    "photometry": "match the exposures",
     "pictures": "check the pictures",
     "light": "solve for the light",
     "recover": "fit the material",

@@ -22,6 +22,7 @@ from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
+from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
@@ -32,6 +33,7 @@ from mistyle.jobs.memory_budget import size_of, with_setting
 from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
+from mistyle.solver.photometry.record import Photometry
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class MadeMaterial:
     recovered: Any
     measured: Measured
     folder: Path
+    photometry: Photometry | None = None
 
 
 def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
@@ -111,6 +114,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
+        whole, photometry = match_exposures(run, asset, whole, shots)
         captures, notes = average_pictures(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *notes))
         if job.lights == "unknown":
@@ -129,8 +133,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         recovered = replace(recovered, maps=tuple(maps))
         shown = replace(captures, cameras=whole.cameras)
         run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, shown))
-        results = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
-        progress.note(*asset.source.notes, *placed.notes, *recovered.notes, *old_report(job))
+        results = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder, photometry)
+        told = photometry.notes if photometry is not None else ()
+        progress.note(*asset.source.notes, *placed.notes, *told, *recovered.notes, *old_report(job))
         if s.report.detail != "none":
             inputs = [s.report, job.name]
             run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, results, progress, r))
@@ -236,7 +241,7 @@ def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> 
     """The captures at about the resolution of the texels, and notes about them."""
     average = run.job.settings.references.average
     folder = run.stage(
-        "pictures", ["texels", "cameras"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
+        "pictures", ["texels", "photometry"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
     )
     return read_averaged(folder, captures)
 

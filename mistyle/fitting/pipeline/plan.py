@@ -31,6 +31,8 @@ from mistyle.jobs.plan import (
 from mistyle.jobs.stages import claim_run
 from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
+PHOTOMETRY_SECONDS = 15  # the number of points is bounded
+
 
 def plan_material(job: Any) -> dict[str, Any]:
     """The plan of a `MaterialJob`; cameras, lights and pictures' headers are read and refused as the job does.
@@ -62,6 +64,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
         "cameras": 1,
+        "photometry": PHOTOMETRY_SECONDS + 1.5 * sum(sizes) * PER_READ_PIXEL if job.lights == "unknown" else 0,
         "pictures": sum(sizes) * PER_READ_PIXEL,
         "recover": (rounds + 2 + steps / len(sizes)) * sampled * PER_LOOK
         + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION

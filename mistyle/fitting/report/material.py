@@ -30,6 +30,7 @@ from mistyle.jobs.report.turntable import write_turn
 from mistyle.jobs.run_record import earlier, merged_peaks, merged_seconds, report_files, write_record
 from mistyle.jobs.stages import Run
 from mistyle.jobs.versions import peak_gb, versions
+from mistyle.solver.photometry.record import as_json
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "seen_share": ("share of the covered texels that at least one reference sees", "higher"),
@@ -241,6 +242,7 @@ def write_summary(results: Any, run: Run) -> dict[str, Any]:
                 strict=True,
             )
         ],
+        **({} if results.photometry is None else {"photometry": as_json(results.photometry)}),
         "seed": job.settings.seed,
         "settings": job.settings.model_dump(mode="json"),
         "versions": versions(),

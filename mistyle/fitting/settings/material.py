@@ -47,6 +47,19 @@ class ReferenceSettings(BaseModel):
     )
 
 
+class PhotometrySettings(BaseModel):
+    """Solving for the pictures' exposure, white balance and vignetting."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mode: Literal["auto", "none", "exposure", "full"] = Field(
+        default="auto",
+        description="solve for each picture's exposure, or (full) also its white balance, the vignetting of all and "
+        "veiling light; auto: full for 8-bit pictures under unknown light without given exposures, else none",
+    )
+    exif: bool = Field(default=True, description="use EXIF's exposure time, f-number and ISO speed as a prior")
+
+
 class MaterialSettings(BaseModel):
     """The settings of one fit of a material to pictures."""
 
@@ -67,6 +80,7 @@ class MaterialSettings(BaseModel):
     )
     read: ReadSettings = ReadSettings()
     references: ReferenceSettings = ReferenceSettings()
+    photometry: PhotometrySettings = PhotometrySettings()
     atlas: AtlasSettings = AtlasSettings(size=1024)
     recover: RecoverSettings = RecoverSettings()
     report: ReportSettings = ReportSettings(frames=12, resolution=384)

@@ -1,6 +1,7 @@
 """Decoder of pictures and textures: headers first, sizes bounded, plain arrays as results."""
 
 import io
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ EXPECTED = "a PNG, JPEG, WebP, TIFF, BMP, GIF or TGA picture"
 CONVERT = "Save it as PNG or JPEG and try again"
 MAX_PICTURE_BYTES = 512 << 20
 ORIENTATION = 0x0112  # the tag of EXIF and TIFF: 1 upright, 2 mirrored, 3 turned by 180 degrees, ... 8
+EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO_SPEED = 0x8769, 0x829A, 0x829D, 0x8827
 BITS_PER_SAMPLE, PLANES, EXTRA_SAMPLES, ASSOCIATED = 258, 284, 338, 1  # TIFF 6.0; 1: colours are multiplied by alpha
 UNDONE_BY = {6: 8, 8: 6}  # the other orientations are their own inverses
 
@@ -80,6 +82,26 @@ def size_of_picture(path: Path) -> tuple[int, int, int]:
     swapped = image.format == "TIFF" and image.tag_v2.get(ORIENTATION) in range(5, 9)
     height, width = (image.width, image.height) if swapped else (image.height, image.width)
     return height, width, _orientation(image)
+
+
+def exposure_of_picture(path: Path) -> tuple[float, float, float]:
+    """See `read_exposure` in io/read.py."""
+    image, _ = _open(read_bytes(path, MAX_PICTURE_BYTES), str(path))
+    try:
+        tags = image.getexif().get_ifd(EXIF_IFD)
+        values = [_number(tags.get(tag)) for tag in (EXPOSURE_TIME, F_NUMBER, ISO_SPEED)]
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, ZeroDivisionError):
+        values = [math.nan] * 3
+    return values[0], values[1], values[2]
+
+
+def _number(value: Any) -> float:
+    """An EXIF value (the first of several) as a positive number, else NaN."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return math.nan
+    return number if math.isfinite(number) and number > 0 else math.nan
 
 
 def texture(data: bytes, where: str, budget: Budget) -> Shaped[np.ndarray, "h w 3"]:
