@@ -8,6 +8,7 @@ import numpy as np
 
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.fitting.report.photometry import photometry_steps
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report import overlays as report_overlays
 from mistyle.jobs.report.charts import Chart
@@ -163,7 +164,7 @@ def steps(results: Any) -> tuple[Step, ...]:
         ),
         columns=2,
     )
-    return (compare, curves, bars, trust)
+    return (compare, *photometry_steps(results), curves, bars, trust)
 
 
 def curve_charts(trace: dict[str, list[float]]) -> list[Chart]:

@@ -9,11 +9,13 @@ Two estimates of exposures, balances and vignetting, both linear in the logarith
    light (lens flare, haze) does not change it. Patches count whose pattern is that of the other pictures.
 
 The veil is then a polynomial in each picture: the difference from the points' radiance at the exposures of 2. It is
-kept where it lowers the robust difference between pictures by LOWER; otherwise 1 is the result.
+kept where it lowers the robust difference between pictures to LOWER of that of 1; otherwise 1 is the result. Nothing is
+corrected where 1 does not lower the difference to LOWER of what reflections alone leave.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -31,7 +33,7 @@ from mistyle.solver.texels.observations import ObservationOptions, TexelObservat
 SIDE = 336  # pixels along the longer side of the small pictures
 ATLAS = 320  # texels a side of the atlas whose texels are the points, all sets together
 OBSERVATIONS = 200_000  # most observations; points are left out evenly
-LEVELS = 50_000  # most observations of the estimate from levels
+LEVELS = 40_000  # most observations of the estimate from levels
 PATCH, REGION = 0.12, 0.5  # sides of patches and of regions in working units: the mesh has radius 1
 FACING = 0.4  # least cosine of the angle of view: sheen grows at grazing angles
 DARK, BRIGHT = 0.01, 0.9  # linear values: weight 1/2 below, none above, where JPEGs are nearly saturated
@@ -92,21 +94,24 @@ def solve_photometry(
     if len(captures) - len(alone) < 2:
         return unchanged(captures, ("Photometry: no two pictures share enough points under the same light.",))
     notes = [f"Photometry: {', '.join(alone)} shares too few points with other pictures."] if alone else []
-    levels, before, after = _levels(samples, full)
+    levels, (before, reflected, after) = _levels(samples, full)
+    agree = after > LOWER * reflected
     chosen, veil = levels, np.zeros((len(captures), VEIL_TERMS, 3))
     progress(0.85)
-    if full and (contrasts := _contrasts(samples, levels)) is not None:
+    if full and not agree and (contrasts := _contrasts(samples, levels)) is not None:
         lifted = _veil(_thinned(samples, LEVELS), contrasts)
         spread = _residuals(samples, contrasts, lifted)[1]
         if spread < LOWER * _residuals(samples, levels, veil)[1]:
             chosen, veil, after = contrasts, lifted, spread
     chosen = _with_exif(chosen, np.asarray(exif, float)) if len(exif) else chosen
     names, shapes = tuple(c.name for c in captures.cameras), tuple(c.size for c in captures.cameras)
+    if agree:
+        chosen = replace(chosen, gain=0 * chosen.gain, vignetting=np.zeros(3))
     residual, scale = _residuals(samples, chosen, veil)
     ignored = ignored_cells(residual, scale, samples.picture, _share(samples, captures), shapes)
     return _gauged(Photometry(
         names, chosen.gain.mean(axis=1), chosen.gain, chosen.vignetting, veil, _deviation(chosen), (before, after),
-        ignored, True, tuple(notes),
+        ignored, not agree, tuple(notes),
     ))  # fmt: skip
 
 
@@ -185,32 +190,44 @@ def _chosen(observed: TexelObservations, values: tuple[np.ndarray, ...], light: 
     return PointSamples(seen.rgb[rows].astype(float), picture, *numbers, *values, len(light), lights)
 
 
-def _levels(samples: PointSamples, full: bool) -> tuple[Response, float, float]:
-    """The estimate from levels, and the spread of the pictures before and after it."""
+def _levels(samples: PointSamples, full: bool) -> tuple[Response, tuple[float, float, float]]:
+    """The estimate from levels, and the spread of the pictures: as they are, by reflections alone, and corrected."""
     few = _thinned(samples, LEVELS)
-    y, weight = _logarithms(few.rgb)
-    point = np.concatenate([3 * few.point + c for c in range(3)])
     n, one = few.pictures, few.picture
+    slant = sparse.csr_array(np.tile(few.slant[:, None] ** [1, 2], (3, 1)))
     if full:
         gains = one_hot(np.concatenate([3 * one + c for c in range(3)]), 3 * n)
-        shared = np.concatenate([fall_terms(few.x), few.slant[:, None] ** [1, 2]], axis=1)
-        first, ridges = [gains, np.tile(shared, (3, 1))], [[1e-5] * (3 * n), FALL_RIDGE, [1e-5] * 2]
+        columns, ridge = [gains, np.tile(fall_terms(few.x), (3, 1)), slant], [[1e-5] * (3 * n), FALL_RIDGE, [1e-5] * 2]
     else:
-        first, ridges = [one_hot(np.tile(one, 3), n)], [[1e-5] * n]
-    value = np.full(3 * (int(few.point.max()) + 1), np.exp(np.median(y)))
-    # A rig of several lights, one at a time, has no reflections in common.
-    for _ in range(REFLECTIONS if few.lights == 1 else 1):
-        reflections = _reflections(few, value) if few.lights == 1 else []
-        columns = sparse.csr_array(sparse.hstack([*first, *reflections]))
-        ridge = np.concatenate([*ridges, np.full(sum(part.shape[1] for part in reflections), 1e-4)])
-        fitted = solve(columns, y, weight, point, np.tile(few.region, 3), ridge)
-        value = np.exp(fitted.point)
-    before = _values(y, weight, point).scale
+        columns, ridge = [one_hot(np.tile(one, 3), n)], [[1e-5] * n]
+    fitted = _reflecting(few, columns, ridge)
+    alone = _reflecting(few, [slant], [[1e-5] * 2])
+    y, weight = _logarithms(few.rgb)
+    spreads = _values(y, weight, _channel_points(few)).scale, alone.scale, fitted.scale
     if full:
-        return _unpacked(fitted, n), before, fitted.scale
+        return _unpacked(fitted, n), spreads
     covariance = np.zeros((3 * n + 3, 3 * n + 3))
     covariance[: 3 * n, : 3 * n] = np.kron(fitted.covariance[:n, :n], np.ones((3, 3)))
-    return Response(np.repeat(fitted.x[:n, None], 3, axis=1), np.zeros(3), covariance), before, fitted.scale
+    return Response(np.repeat(fitted.x[:n, None], 3, axis=1), np.zeros(3), covariance), spreads
+
+
+def _reflecting(samples: PointSamples, columns: Sequence[Any], ridge: Sequence[Sequence[float]]) -> LinearFit:
+    """The solution for `columns`, with the reflections of a common light as further unknowns."""
+    (y, weight), point = _logarithms(samples.rgb), _channel_points(samples)
+    value = np.full(3 * (int(samples.point.max()) + 1), np.exp(np.median(y)))
+    # Lights that shine one at a time have no reflections in common.
+    for _ in range(REFLECTIONS if samples.lights == 1 else 1):
+        reflections = _reflections(samples, value) if samples.lights == 1 else []
+        matrix = sparse.csr_array(sparse.hstack([*columns, *reflections]))
+        penalty = np.concatenate([*ridge, np.full(sum(part.shape[1] for part in reflections), 1e-4)])
+        fitted = solve(matrix, y, weight, point, np.tile(samples.region, 3), penalty)
+        value = np.exp(fitted.point)
+    return fitted
+
+
+def _channel_points(samples: PointSamples) -> Int[np.ndarray, " o3"]:
+    """The number of each channel's point value, the three channels one after the other."""
+    return np.concatenate([3 * samples.point + c for c in range(3)])
 
 
 def _thinned(samples: PointSamples, most: int) -> PointSamples:
@@ -321,8 +338,7 @@ def _residuals(samples: PointSamples, response: Response, veil: np.ndarray) -> t
     """Each corrected observation's log difference from its point's value (o 3), and their robust scale."""
     lifted = np.maximum(np.einsum("ok,okc->oc", veil_terms(samples.x), veil[samples.picture]), 0)
     radiance = np.maximum(samples.rgb / _gain(samples, response) - lifted, 1e-4)
-    point = np.concatenate([3 * samples.point + c for c in range(3)])
-    fitted = _values(np.log(radiance).T.ravel(), _logarithms(samples.rgb)[1], point)
+    fitted = _values(np.log(radiance).T.ravel(), _logarithms(samples.rgb)[1], _channel_points(samples))
     return fitted.residual.reshape(3, -1).T, fitted.scale
 
 
@@ -372,6 +388,7 @@ def _gauged(found: Photometry) -> Photometry:
     corner = abs(float(found.vignetting.sum()))
     most = max(float(np.abs(exposure).max()), float(np.abs(balance).max()), corner, float(np.abs(veil).max()))
     notes = found.notes
-    if most < AGREE:
-        notes = (*notes, f"Photometry: the pictures agree within {100 * AGREE:.0f} %; nothing was corrected.")
-    return replace(found, exposure=exposure, balance=balance, veil=veil, applied=most >= AGREE, notes=notes)
+    applied = found.applied and most >= AGREE
+    if not applied:
+        notes = (*notes, "Photometry: different exposures do not explain the pictures better; nothing was corrected.")
+    return replace(found, exposure=exposure, balance=balance, veil=veil, applied=applied, notes=notes)
