@@ -71,7 +71,7 @@ def add_fit(verbs: Any) -> None:
         type=Path,
         nargs="?",
         metavar="REFERENCES",
-        help="a folder with camera.json, transforms.json or a COLMAP model, and its pictures",
+        help="a folder with camera.json, transforms.json, a COLMAP model or Meshroom's cameras.sfm, and its pictures",
     )
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; rerun to resume")
     verb.add_argument("--dry-run", action="store_true", help="print estimated time, memory and disk, and stop")

@@ -5,6 +5,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -209,15 +210,17 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
     ):
         if head.startswith(mark) or (mark == b"<svg" and b"<svg" in head):
             raise refuse(where, name, EXPECTED, "Export it as PNG from the program that made it")
-    if data[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1"):
-        raise refuse(where, "a HEIC photograph", EXPECTED, CONVERT)
+    heic = data[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1")
+    if heic and not _heic_decoder():
+        fix = "Export it as JPEG, or install a decoder beside mistyle (pip install pillow-heif; its codec is GPL)"
+        raise refuse(where, "a HEIC photograph", EXPECTED, fix)
     if data[:4] == b"\x76\x2f\x31\x01" or head.startswith(b"#?r"):
         raise refuse(where, "a high-dynamic-range picture", EXPECTED, "Tone-map it and save it as PNG")
     Image.init()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(io.BytesIO(data), formats=[f for f in FORMATS if f in Image.OPEN])
+            image = Image.open(io.BytesIO(data), formats=[f for f in (*FORMATS, *["HEIF"] * heic) if f in Image.OPEN])
             several = bool(getattr(image, "is_animated", False))  # counting the frames may take minutes
     except Image.DecompressionBombError as error:
         raise _too_large(where, "far too many pixels") from error
@@ -234,6 +237,16 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         [f"Only the {first_parts.get(str(image.format), 'first frame of the animation')} was read."] if several else []
     )
     return image, notes
+
+
+def _heic_decoder() -> bool:
+    """Whether the user has installed pillow-heif; it is then registered with Pillow."""
+    try:
+        pillow_heif: Any = import_module("pillow_heif")
+        pillow_heif.register_heif_opener()
+    except (ImportError, OSError):
+        return False
+    return True
 
 
 def _too_large(where: str, found: str) -> InputRefused:
