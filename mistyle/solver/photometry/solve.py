@@ -41,6 +41,7 @@ PATTERN, SAMPLES = 0.8, 12  # least correlation of a patch with the other pictur
 PATCHES = 8  # of each picture, for the estimate by contrasts
 CONTRAST_STEPS = 4
 LOWER = 0.9
+SHEEN = 8  # terms of `_sheen`
 REFLECTIONS = 3  # solves for levels, each with the reflections over the radiance of the last
 DARKEST = 0.2  # of the median radiance: darker points count as so bright where radiance is a divisor
 AGREE = 0.02  # log: pictures whose numbers are all smaller are left as they are
@@ -51,8 +52,8 @@ EXIF = 0.2  # standard deviation of an exposure around EXIF's, log: cameras deve
 @dataclass(frozen=True)
 class PointSamples:
     """o observations of points. A point is a texel under one light, `patch` a small piece of the surface and `region` a
-    large one; `x` is the position in the picture (`record.coordinates`), `slant` 1 - cosine of the angle of view, and
-    `mirrored` the reflected direction of view. `lights` counts the different lights."""
+    large one; `x` is the position in the picture (`record.coordinates`), `away` the direction to the camera, `mirrored`
+    its reflection and `slant` 1 - cosine of its angle with the normal. `lights` counts the different lights."""
 
     rgb: Float[np.ndarray, "o 3"]
     picture: Int[np.ndarray, " o"]
@@ -60,6 +61,7 @@ class PointSamples:
     patch: Int[np.ndarray, " o"]
     region: Int[np.ndarray, " o"]
     slant: Float[np.ndarray, " o"]
+    away: Float[np.ndarray, "o 3"]
     mirrored: Float[np.ndarray, "o 3"]
     x: Float[np.ndarray, "o 2"]
     pictures: int
@@ -144,7 +146,7 @@ def collect_points(
     cosine = (away * normal[texel]).sum(axis=1)
     mirrored = 2 * cosine[:, None] * normal[texel] - away
     pieces = [_pieces(position, normal, side)[texel] for side in (PATCH, REGION)]
-    return _chosen(observed, (x, 1 - cosine, mirrored, *pieces), _alike(lights), seed)
+    return _chosen(observed, (x, 1 - cosine, away, mirrored, *pieces), _alike(lights), seed)
 
 
 def _alike(lights: Sequence[Lights]) -> Int[np.ndarray, " n"]:
@@ -172,9 +174,9 @@ def _pieces(position: Float[np.ndarray, "t 3"], normal: Float[np.ndarray, "t 3"]
 def _chosen(observed: TexelObservations, values: tuple[np.ndarray, ...], light: np.ndarray, seed: int) -> PointSamples:
     """Samples of points that at least two pictures show in the same light, at most about OBSERVATIONS.
 
-    `values` per observation: x, slant, reflected direction, patch and region.
+    `values` per observation: x, slant, direction to the camera and its reflection, patch and region.
     """
-    seen, (x, slant, mirrored, patch, region) = observed.observations, values
+    seen, (x, slant, away, mirrored, patch, region) = observed.observations, values
     texel, lights = np.repeat(np.arange(len(observed.texel)), observed.seen), int(light.max()) + 1
     point = texel * lights + light[seen.picture]
     usable = (seen.rgb.max(axis=1) < BRIGHT) & (seen.rgb.min(axis=1) > 0)
@@ -186,7 +188,7 @@ def _chosen(observed: TexelObservations, values: tuple[np.ndarray, ...], light: 
     own = light[seen.picture[rows]]
     numbers = [np.unique(of[rows] * lights + own, return_inverse=True)[1] for of in (texel, patch, region)]
     picture = seen.picture[rows].astype(np.int64)
-    values = slant[rows], mirrored[rows], x[rows]
+    values = slant[rows], away[rows], mirrored[rows], x[rows]
     return PointSamples(seen.rgb[rows].astype(float), picture, *numbers, *values, len(light), lights)
 
 
@@ -194,14 +196,17 @@ def _levels(samples: PointSamples, full: bool) -> tuple[Response, tuple[float, f
     """The estimate from levels, and the spread of the pictures: as they are, by reflections alone, and corrected."""
     few = _thinned(samples, LEVELS)
     n, one = few.pictures, few.picture
-    slant = sparse.csr_array(np.tile(few.slant[:, None] ** [1, 2], (3, 1)))
+    slant = sparse.csr_array(np.tile(_sheen(few), (3, 1)))
     if full:
         gains = one_hot(np.concatenate([3 * one + c for c in range(3)]), 3 * n)
-        columns, ridge = [gains, np.tile(fall_terms(few.x), (3, 1)), slant], [[1e-5] * (3 * n), FALL_RIDGE, [1e-5] * 2]
+        columns, ridge = (
+            [gains, np.tile(fall_terms(few.x), (3, 1)), slant],
+            [[1e-5] * (3 * n), FALL_RIDGE, [1e-5] * SHEEN],
+        )
     else:
         columns, ridge = [one_hot(np.tile(one, 3), n)], [[1e-5] * n]
     fitted = _reflecting(few, columns, ridge)
-    alone = _reflecting(few, [slant], [[1e-5] * 2])
+    alone = _reflecting(few, [slant], [[1e-5] * SHEEN])
     y, weight = _logarithms(few.rgb)
     spreads = _values(y, weight, _channel_points(few)).scale, alone.scale, fitted.scale
     if full:
@@ -225,6 +230,13 @@ def _reflecting(samples: PointSamples, columns: Sequence[Any], ridge: Sequence[S
     return fitted
 
 
+def _sheen(samples: PointSamples) -> Float[np.ndarray, "o k"]:
+    """Terms of diffuse reflection's dependence on the angle of view, alike on all surfaces; under light from one side it
+    depends on the side of the camera too."""
+    bent = samples.slant[:, None] ** [1, 2]
+    return np.concatenate([bent, bent[:, :1] * samples.away, bent[:, 1:] * samples.away], axis=1)
+
+
 def _channel_points(samples: PointSamples) -> Int[np.ndarray, " o3"]:
     """The number of each channel's point value, the three channels one after the other."""
     return np.concatenate([3 * samples.point + c for c in range(3)])
@@ -237,7 +249,7 @@ def _thinned(samples: PointSamples, most: int) -> PointSamples:
     numbers = {
         name: np.unique(getattr(samples, name)[rows], return_inverse=True)[1] for name in ("point", "patch", "region")
     }
-    values = {name: getattr(samples, name)[rows] for name in ("rgb", "picture", "slant", "mirrored", "x")}
+    values = {name: getattr(samples, name)[rows] for name in ("rgb", "picture", "slant", "away", "mirrored", "x")}
     return replace(samples, **numbers, **values)
 
 

@@ -1,0 +1,94 @@
+"""A sun beside the cells of an unknown light, and the gauge by a surface of known albedo.
+
+The cells of `cells.py` are too wide for the borders of shadows, and a shadow that the light does not explain ends up in
+the albedo. The sun is one more cell of SUN steradian without neighbours. Its direction is that whose shading and shadows
+explain most of the differences between neighbouring texels, whose albedo is alike more often than not.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from mistyle.core.camera import Camera
+from mistyle.core.errors import InputRefused
+from mistyle.core.image import luminance
+from mistyle.core.light import Directional, Environment, Lights
+from mistyle.core.maps import Maps
+from mistyle.fitting.light import solve as light_solve
+from mistyle.fitting.light.cells import LightCells, environment_of
+from mistyle.fitting.light.solve import Bundle, State
+from mistyle.render.deferred.sky import even_directions
+from mistyle.render.mitsuba.draw import Tracer, gbuffer
+from mistyle.solver.texels.gbuffer import open_sky
+from mistyle.solver.texels.observations import TexelObservations
+
+SUN = 0.01  # solid angle of the sun's cell, sr: 3° in radius, so that the system stays well conditioned
+DIRECTIONS = 512  # candidates over the sphere
+STRENGTHS = (0.5, 1.0, 2.0, 4.0)  # irradiance of a facing surface over that of the sky
+NEIGHBOURS = 6  # of a texel
+AGAINST = 0.9  # least share of the differences that must remain unexplained for there to be no sun
+LOWER = 0.98  # the sun is kept where it lowers the cost of the joint solve to this share
+STEPS = 4
+
+
+@dataclass(frozen=True)
+class Sun:
+    """Unit direction towards the sun, and the share of neighbouring texels' differences that it leaves, 0..1."""
+
+    direction: Float[np.ndarray, "3"]
+    left: float
+
+
+def find_sun(
+    traced: Tracer, observed: TexelObservations, normal: Float[np.ndarray, "t 3"], radiance: Float[np.ndarray, "t 3"]
+) -> Sun | None:
+    """The direction that explains most; None where none leaves less than AGAINST of the differences.
+
+    radiance  of each observed texel, mean over the pictures
+    """
+    position = observed.points.position
+    seen = (observed.seen > 0) & (radiance.min(axis=1) > 0)
+    pairs = _pairs(position, normal, np.flatnonzero(seen))
+    step = np.log(np.maximum(luminance(radiance.astype(np.float32)), 1e-6)).astype(float)
+    differences = step[pairs[:, 0]] - step[pairs[:, 1]]
+    best: Sun | None = None
+    directions = even_directions(DIRECTIONS).astype(np.float32)
+    bits = open_sky(traced, position, normal, directions)
+    # What no sun leaves, of each pair's absolute difference: the median is robust against edges of the albedo.
+    nothing = float(np.abs(differences).mean())
+    for k, direction in enumerate(directions.astype(float)):
+        free = (bits[:, k // 32] >> np.uint32(k % 32)) & 1
+        facing = np.maximum(normal @ direction, 0) * free
+        if facing[seen].max(initial=0) < 0.1:
+            continue
+        for strength in STRENGTHS:
+            shade = np.log1p(strength * facing)
+            left = float(np.abs(differences - (shade[pairs[:, 0]] - shade[pairs[:, 1]])).mean()) / max(nothing, 1e-12)
+            if left < AGAINST and (best is None or left < best.left):
+                best = Sun(direction, left)
+    return best
+
+
+def _pairs(position: np.ndarray, normal: np.ndarray, chosen: Int[np.ndarray, " n"]) -> Int[np.ndarray, "p 2"]:
+    """Pairs of near texels among `chosen`."""
+    near = np.asarray(KDTree(position[chosen]).query(position[chosen], NEIGHBOURS + 1)[1])[:, 1:]
+    both = np.stack([np.repeat(np.arange(len(chosen)), near.shape[1]), near.ravel()], axis=1)
+    return chosen[np.unique(np.sort(both, axis=1), axis=0)]
+
+
+def with_sun(cells: LightCells, direction: Float[np.ndarray, "3"]) -> LightCells:
+    """The cells, and the sun as the last of them, without neighbours."""
+    return LightCells(
+        np.concatenate([cells.direction, direction[None]]), np.concatenate([cells.angle, [SUN]]), cells.pairs
+    )
+
+
+def split_sun(cells: LightCells, radiance: Float[np.ndarray, "k 3"]) -> Lights:
+    """The environment of all cells but the last, and the last as a directional light."""
+    sky = environment_of(LightCells(cells.direction[:-1], cells.angle[:-1], cells.pairs), radiance[:-1])
+    x, y, z = cells.direction[-1].tolist()
+    r, g, b = (radiance[-1] * cells.angle[-1]).tolist()
+    return (sky, Directional((x, y, z), (r, g, b))) if max(r, g, b) > 0 else (sky,)
