@@ -45,6 +45,7 @@ OPTIONS = {
     **REPORT_OPTIONS,
     **DELIVERY_OPTIONS,
 }
+LIGHT_HELP = "unknown: estimate the light too; outdoors: an environment and a sun"
 SCENE_OPTIONS = {
     name: name for name in ("seed", "threads", "variant", "iterations", "spp", "spp_grad", "loss", "channels")
 }
@@ -89,7 +90,12 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--lights", type=Path, metavar="FILE", help="a lights.json (default: the one beside the cameras)"
     )
-    group.add_argument("--light", choices=["known", "unknown"], default="known", help="unknown: estimate the light too")
+    group.add_argument("--light", choices=["known", "unknown", "outdoors"], default="known", help=LIGHT_HELP)
+    group.add_argument(
+        "--albedo-of",
+        metavar="MASK=VALUE",
+        help="scale of an unknown light: MASK, named after a picture, is white on a surface of this albedo (0.18 or r,g,b)",
+    )
     group.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white pixels are valid")
     group.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
     group.add_argument(
@@ -186,10 +192,28 @@ def run_fit(options: argparse.Namespace) -> int:
 def material_settings(options: argparse.Namespace) -> Any:
     """The resolved settings of `mistyle fit MESH REFERENCES`."""
     from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
-    from mistyle.jobs.settings import resolve
+    from mistyle.jobs.settings import merge, resolve
 
     chosen = given_settings(options, OPTIONS)
+    if options.light == "outdoors":
+        chosen = merge(chosen, {"light": {"sun": True}})
+    if options.albedo_of is not None:
+        chosen = merge(chosen, {"light": {"albedo": known_albedo(options)[1]}})
     return resolve(options.preset, options.config, chosen, root=MaterialSettings, presets=MATERIAL_PRESETS)
+
+
+def known_albedo(options: argparse.Namespace) -> tuple[Path, tuple[float, ...]]:
+    """Mask and albedo of --albedo-of; UsageError for another form, and under known light."""
+    mask, _, value = options.albedo_of.rpartition("=")
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        numbers = ()
+    if not mask or len(numbers) not in (1, 3) or not all(0 < number <= 1 for number in numbers):
+        raise UsageError(f"--albedo-of {options.albedo_of}: expected MASK=VALUE with one or three numbers up to 1")
+    if options.light == "known":
+        raise UsageError("--albedo-of needs --light unknown or outdoors: a known light has its scale")
+    return Path(mask), numbers * 3 if len(numbers) == 1 else numbers
 
 
 def _fit_scene(options: argparse.Namespace) -> int:
@@ -243,12 +267,13 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         options.out,
         settings,
         asset_name(options, options.mesh.stem),
-        "unknown" if options.light == "unknown" else options.lights,
+        options.lights if options.light == "known" else "unknown",
         options.masks,
         options.exposure,
         options.pictures,
-        options.redo_from,
-        options.overwrite,
+        redo_from=options.redo_from,
+        overwrite=options.overwrite,
+        albedo_of=None if options.albedo_of is None else known_albedo(options)[0],
     )
     if options.dry_run:
         estimate = plan_material(job)

@@ -1,27 +1,21 @@
-"""A sun beside the cells of an unknown light, and the gauge by a surface of known albedo.
+"""A sun beside the cells of an unknown light.
 
 The cells of `cells.py` are too wide for the borders of shadows, and a shadow that the light does not explain ends up in
-the albedo. The sun is one more cell of SUN steradian without neighbours. Its direction is that whose shading and shadows
-explain most of the differences between neighbouring texels, whose albedo is alike more often than not.
+the albedo. The sun is one more cell, of SUN steradian and without neighbours. Its direction is the one whose shading
+and shadows explain most of the differences between neighbouring texels, whose albedo is more often alike than not.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from mistyle.core.camera import Camera
-from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance
-from mistyle.core.light import Directional, Environment, Lights
-from mistyle.core.maps import Maps
-from mistyle.fitting.light import solve as light_solve
-from mistyle.fitting.light.cells import LightCells, environment_of
-from mistyle.fitting.light.solve import Bundle, State
+from mistyle.core.light import Directional
+from mistyle.fitting.light.cells import LightCells
 from mistyle.render.deferred.sky import even_directions
-from mistyle.render.mitsuba.draw import Tracer, gbuffer
+from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.texels.gbuffer import open_sky
 from mistyle.solver.texels.observations import TexelObservations
 
@@ -29,9 +23,7 @@ SUN = 0.01  # solid angle of the sun's cell, sr: 3° in radius, so that the syst
 DIRECTIONS = 512  # candidates over the sphere
 STRENGTHS = (0.5, 1.0, 2.0, 4.0)  # irradiance of a facing surface over that of the sky
 NEIGHBOURS = 6  # of a texel
-AGAINST = 0.9  # least share of the differences that must remain unexplained for there to be no sun
-LOWER = 0.98  # the sun is kept where it lowers the cost of the joint solve to this share
-STEPS = 4
+AGAINST = 0.9  # largest share of the differences that a sun may leave
 
 
 @dataclass(frozen=True)
@@ -42,13 +34,9 @@ class Sun:
     left: float
 
 
-def find_sun(
-    traced: Tracer, observed: TexelObservations, normal: Float[np.ndarray, "t 3"], radiance: Float[np.ndarray, "t 3"]
-) -> Sun | None:
-    """The direction that explains most; None where none leaves less than AGAINST of the differences.
-
-    radiance  of each observed texel, mean over the pictures
-    """
+def find_sun(traced: Tracer, observed: TexelObservations, normal: Float[np.ndarray, "t 3"]) -> Sun | None:
+    """The direction that explains most; None where none leaves less than AGAINST of the differences."""
+    radiance = mean_radiance(observed)
     position = observed.points.position
     seen = (observed.seen > 0) & (radiance.min(axis=1) > 0)
     pairs = _pairs(position, normal, np.flatnonzero(seen))
@@ -57,7 +45,6 @@ def find_sun(
     best: Sun | None = None
     directions = even_directions(DIRECTIONS).astype(np.float32)
     bits = open_sky(traced, position, normal, directions)
-    # What no sun leaves, of each pair's absolute difference: the median is robust against edges of the albedo.
     nothing = float(np.abs(differences).mean())
     for k, direction in enumerate(directions.astype(float)):
         free = (bits[:, k // 32] >> np.uint32(k % 32)) & 1
@@ -72,6 +59,13 @@ def find_sun(
     return best
 
 
+def mean_radiance(observed: TexelObservations) -> Float[np.ndarray, "t 3"]:
+    """The mean of each texel's observations; 0 without any."""
+    owner = np.repeat(np.arange(len(observed.texel)), observed.seen)
+    sums = [np.bincount(owner, observed.observations.rgb[:, c], len(observed.texel)) for c in range(3)]
+    return np.stack(sums, axis=1) / np.maximum(observed.seen, 1)[:, None]
+
+
 def _pairs(position: np.ndarray, normal: np.ndarray, chosen: Int[np.ndarray, " n"]) -> Int[np.ndarray, "p 2"]:
     """Pairs of near texels among `chosen`."""
     near = np.asarray(KDTree(position[chosen]).query(position[chosen], NEIGHBOURS + 1)[1])[:, 1:]
@@ -79,16 +73,21 @@ def _pairs(position: np.ndarray, normal: np.ndarray, chosen: Int[np.ndarray, " n
     return chosen[np.unique(np.sort(both, axis=1), axis=0)]
 
 
-def with_sun(cells: LightCells, direction: Float[np.ndarray, "3"]) -> LightCells:
-    """The cells, and the sun as the last of them, without neighbours."""
-    return LightCells(
-        np.concatenate([cells.direction, direction[None]]), np.concatenate([cells.angle, [SUN]]), cells.pairs
-    )
+def with_sun(
+    cells: LightCells, radiance: Float[np.ndarray, "k 3"], sun: Sun
+) -> tuple[LightCells, Float[np.ndarray, "n 3"]]:
+    """The cells with the sun as the last of them, and their radiance; the sun begins as bright as its surroundings."""
+    own = radiance[int((cells.direction @ sun.direction).argmax())]
+    direction = np.concatenate([cells.direction, sun.direction[None]])
+    whole = LightCells(direction, np.concatenate([cells.angle, [SUN]]), cells.pairs)
+    return whole, np.concatenate([radiance, own[None]])
 
 
-def split_sun(cells: LightCells, radiance: Float[np.ndarray, "k 3"]) -> Lights:
-    """The environment of all cells but the last, and the last as a directional light."""
-    sky = environment_of(LightCells(cells.direction[:-1], cells.angle[:-1], cells.pairs), radiance[:-1])
+def without_sun(
+    cells: LightCells, radiance: Float[np.ndarray, "n 3"]
+) -> tuple[LightCells, Float[np.ndarray, "k 3"], Directional]:
+    """The inverse of `with_sun`: the sky's cells and radiance, and the sun as a directional light."""
     x, y, z = cells.direction[-1].tolist()
     r, g, b = (radiance[-1] * cells.angle[-1]).tolist()
-    return (sky, Directional((x, y, z), (r, g, b))) if max(r, g, b) > 0 else (sky,)
+    sky = LightCells(cells.direction[:-1], cells.angle[:-1], cells.pairs)
+    return sky, radiance[:-1], Directional((x, y, z), (r, g, b))

@@ -35,5 +35,6 @@ class MaterialJob:
     masks: Path | None = None
     exposure: Path | None = None
     pictures: Path | None = None
+    albedo_of: Path | None = None
     redo_from: str | None = None
     overwrite: bool = False

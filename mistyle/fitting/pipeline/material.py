@@ -145,7 +145,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 def inputs_of(job: MaterialJob) -> list[Path]:
     """Every input file and folder of the job."""
     lights = job.lights if isinstance(job.lights, Path) else None
-    paths = (job.references, lights, job.masks, job.exposure, job.pictures)
+    paths = (job.references, lights, job.masks, job.exposure, job.pictures, job.albedo_of)
     return [*input_files(job.mesh), *(path for path in paths if path is not None)]
 
 
@@ -251,8 +251,36 @@ def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
     from mistyle.fitting.light.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
-    estimate = run.record("light", ["pictures"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))
-    return replace(captures, lights=tuple((estimate.light,) for _ in captures.cameras))
+    card = [run.job.albedo_of] if run.job.albedo_of is not None else []
+
+    def solved(report: Report) -> Any:
+        found = find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
+        return with_known_albedo(run, asset, captures, found)
+
+    estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)
+    if s.light.sun and estimate.sun is None:
+        run.progress.note("No direction of a sun explains the shading: the light is an environment alone.")
+    return replace(captures, lights=tuple(estimate.lights for _ in captures.cameras))
+
+
+def with_known_albedo(run: Run, asset: Asset, captures: Captures, found: Any) -> Any:
+    """The light in the scale of the surface that --albedo-of names; unchanged without one."""
+    from mistyle.fitting.light.gauge import gauged
+    from mistyle.io.cameras.camera_files import stem
+    from mistyle.io.read import read_picture
+    from mistyle.solver.photometry.record import at_size
+
+    mask, albedo = run.job.albedo_of, run.job.settings.light.albedo
+    if mask is None or albedo is None:
+        return found
+    named = [camera for camera in captures.cameras if camera.name == stem(mask.name)]
+    if not named:
+        names = ", ".join(camera.name for camera in captures.cameras[:3])
+        raise InputRefused(f"{mask}: found no picture of that name, expected one of {names}, ... Rename the mask.")
+    surface = at_size(read_picture(mask, "stored").rgb.mean(axis=-1) > 0.5, named[0].size)
+    found, factor = gauged(asset.mesh, found, named[0], surface, albedo)
+    run.progress.note(f"The known albedo of {mask.name} scaled all albedos by {', '.join(f'{v:.3g}' for v in factor)}.")
+    return found
 
 
 def lights_in_order(lights: Sequence[Lights]) -> list[int]:

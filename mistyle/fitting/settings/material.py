@@ -60,6 +60,17 @@ class PhotometrySettings(BaseModel):
     exif: bool = Field(default=True, description="use EXIF's exposure time, f-number and ISO speed as a prior")
 
 
+class LightSettings(BaseModel):
+    """Solving for an unknown light."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sun: bool = Field(default=False, description="look for a sun beside the environment (--light outdoors)")
+    albedo: tuple[float, float, float] | None = Field(
+        default=None, description="albedo (linear) of the surface that --albedo-of masks; it fixes the light's scale"
+    )
+
+
 class MaterialSettings(BaseModel):
     """The settings of one fit of a material to pictures."""
 
@@ -81,6 +92,7 @@ class MaterialSettings(BaseModel):
     read: ReadSettings = ReadSettings()
     references: ReferenceSettings = ReferenceSettings()
     photometry: PhotometrySettings = PhotometrySettings()
+    light: LightSettings = LightSettings()
     atlas: AtlasSettings = AtlasSettings(size=1024)
     recover: RecoverSettings = RecoverSettings()
     report: ReportSettings = ReportSettings(frames=12, resolution=384)

@@ -231,8 +231,8 @@ def _reflecting(samples: PointSamples, columns: Sequence[Any], ridge: Sequence[S
 
 
 def _sheen(samples: PointSamples) -> Float[np.ndarray, "o k"]:
-    """Terms of diffuse reflection's dependence on the angle of view, alike on all surfaces; under light from one side it
-    depends on the side of the camera too."""
+    """Terms of diffuse reflection's dependence on the angle of view, alike on all surfaces; under light from one side
+    it depends on the side of the camera too."""
     bent = samples.slant[:, None] ** [1, 2]
     return np.concatenate([bent, bent[:, :1] * samples.away, bent[:, 1:] * samples.away], axis=1)
 
