@@ -36,6 +36,7 @@ OPTIONS = {
     "refine_poses": "references.refine_poses",
     "hold_out": "references.hold_out",
     "hold_out_light": "references.hold_out_light",
+    "photometry": "photometry.mode",
     "material": "recover.model",
     "frame": "recover.frame",
     "metallic": "recover.metallic",
@@ -46,6 +47,7 @@ OPTIONS = {
     **REPORT_OPTIONS,
     **DELIVERY_OPTIONS,
 }
+LIGHT_HELP = "unknown: estimate the light too; outdoors: an environment and a sun"
 SCENE_OPTIONS = {
     name: name for name in ("seed", "threads", "variant", "iterations", "spp", "spp_grad", "loss", "channels")
 }
@@ -72,7 +74,7 @@ def add_fit(verbs: Any) -> None:
         type=Path,
         nargs="?",
         metavar="REFERENCES",
-        help="a folder with camera.json, transforms.json or a COLMAP model, and its pictures",
+        help="a folder with camera.json, transforms.json, a COLMAP model or Meshroom's cameras.sfm, and its pictures",
     )
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; rerun to resume")
     verb.add_argument("--dry-run", action="store_true", help="print estimated time, memory and disk, and stop")
@@ -92,11 +94,22 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--lights", type=Path, metavar="FILE", help="a lights.json (default: the one beside the cameras)"
     )
-    group.add_argument("--light", choices=["known", "unknown"], default="known", help="unknown: estimate the light too")
+    group.add_argument("--light", choices=["known", "unknown", "outdoors"], default="known", help=LIGHT_HELP)
+    group.add_argument(
+        "--albedo-of",
+        metavar="MASK=VALUE",
+        help="scale of an unknown light: MASK, named after a picture, is white on a surface of this albedo (0.18 or r,g,b)",
+    )
     group.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white pixels are valid")
     group.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
     group.add_argument(
         "--pictures", type=Path, metavar="DIR", help="folder of the pictures (default: the paths in the cameras' file)"
+    )
+    group.add_argument(
+        "--photometry",
+        choices=["none", "exposure", "full"],
+        help="solve for exposures, or also white balance, vignetting and veiling light (default: full under unknown "
+        "light for 8-bit pictures without --exposure)",
     )
     group.add_argument(
         "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"
@@ -185,10 +198,28 @@ def run_fit(options: argparse.Namespace) -> int:
 def material_settings(options: argparse.Namespace) -> Any:
     """The resolved settings of `mistyle fit MESH REFERENCES`."""
     from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
-    from mistyle.jobs.settings import resolve
+    from mistyle.jobs.settings import merge, resolve
 
     chosen = given_settings(options, OPTIONS)
+    if options.light == "outdoors":
+        chosen = merge(chosen, {"light": {"sun": True}})
+    if options.albedo_of is not None:
+        chosen = merge(chosen, {"light": {"albedo": known_albedo(options)[1]}})
     return resolve(options.preset, options.config, chosen, root=MaterialSettings, presets=MATERIAL_PRESETS)
+
+
+def known_albedo(options: argparse.Namespace) -> tuple[Path, tuple[float, ...]]:
+    """Mask and albedo of --albedo-of; UsageError for another form, and under known light."""
+    mask, _, value = options.albedo_of.rpartition("=")
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        numbers = ()
+    if not mask or len(numbers) not in (1, 3) or not all(0 < number <= 1 for number in numbers):
+        raise UsageError(f"--albedo-of {options.albedo_of}: expected MASK=VALUE with one or three numbers up to 1")
+    if options.light == "known":
+        raise UsageError("--albedo-of needs --light unknown or outdoors: a known light has its scale")
+    return Path(mask), numbers * 3 if len(numbers) == 1 else numbers
 
 
 def _fit_scene(options: argparse.Namespace) -> int:
@@ -242,12 +273,13 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         options.out,
         settings,
         asset_name(options, options.mesh.stem),
-        "unknown" if options.light == "unknown" else options.lights,
+        options.lights if options.light == "known" else "unknown",
         options.masks,
         options.exposure,
         options.pictures,
-        options.redo_from,
-        options.overwrite,
+        redo_from=options.redo_from,
+        overwrite=options.overwrite,
+        albedo_of=None if options.albedo_of is None else known_albedo(options)[0],
     )
     if options.dry_run:
         estimate = plan_material(job)

@@ -24,6 +24,7 @@ __all__ = [
     "Picture",
     "read_colmap",
     "read_colmap_points",
+    "read_exposure",
     "read_exr",
     "read_frame",
     "read_hdr",
@@ -37,6 +38,12 @@ __all__ = [
     "read_yaml",
     "shrink_picture",
 ]
+
+
+def read_exposure(path: Path) -> tuple[float, float, float]:
+    """Exposure time in seconds, f-number and ISO speed by EXIF; NaN for each that the picture does not have."""
+    seconds, f_number, iso = ask("exposure", Path(path))
+    return seconds, f_number, iso
 
 
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:

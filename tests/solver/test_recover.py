@@ -661,13 +661,13 @@ def test_pixels_with_an_edge_in_them_do_not_count():
     seen, corners = plane(camera, 4.3), plane(of_corners(camera), 4.8)
     wanted = np.ones((8, 8), bool)
     wanted[:, 4] = False
-    assert np.array_equal(recover_observe._unmixed_pixels(camera, seen, corners), wanted)
+    assert np.array_equal(recover_observe.unmixed_pixels(camera, seen, corners), wanted)
     steady = recover_observe._uniform_light(seen.lit[0], corners.lit[0])
     assert np.array_equal(steady, np.repeat([0, 0, -1, 1, 1, 1, 1, 1], 8).reshape(8, 8))
     hole = corners.mask.copy()
     hole[2, 2] = False
     wanted[1:3, 1:3] = False
-    assert np.array_equal(recover_observe._unmixed_pixels(camera, seen, replace(corners, mask=hole)), wanted)
+    assert np.array_equal(recover_observe.unmixed_pixels(camera, seen, replace(corners, mask=hole)), wanted)
 
 
 def test_pictures_that_say_nothing(world):

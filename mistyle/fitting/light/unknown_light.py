@@ -18,10 +18,11 @@ from mistyle.core.camera import Camera, resized
 from mistyle.core.capture import Captures, in_memory
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance
-from mistyle.core.light import Ambient, Environment
+from mistyle.core.light import Ambient, Directional, Environment, Lights
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.fitting.light import cells as light_cells
+from mistyle.fitting.light import outdoors
 from mistyle.fitting.light import solve as light_solve
 from mistyle.fitting.light.solve import Bundle, State
 from mistyle.render.deferred.material_table import ALBEDO
@@ -43,11 +44,17 @@ BRIGHT = 0.8  # luminance of the 95th percentile of albedo
 
 @dataclass(frozen=True)
 class FoundLight:
-    """The light, the relative residual of the small pictures after each step, and the coarse materials."""
+    """The light, the relative residual of the small pictures after each step, the coarse materials, and the sun where
+    one was asked for and is there."""
 
     light: Environment
     residuals: tuple[float, ...]
     maps: tuple[Maps, ...]
+    sun: Directional | None = None
+
+    @property
+    def lights(self) -> Lights:
+        return (self.light,) if self.sun is None else (self.light, self.sun)
 
 
 def find_light(
@@ -55,8 +62,11 @@ def find_light(
     captures: Captures,
     settings: RecoverSettings,
     progress: Callable[[float], None] = lambda done: None,
+    *,
+    outside: bool = False,
 ) -> FoundLight:
-    """One environment, fixed to the world, for all pictures; `captures.lights` are ignored.
+    """One environment, fixed to the world, for all pictures; `captures.lights` are ignored. `outside` looks for
+    a sun too.
 
     Needs views from around the object. A surface without highlights determines the light only at low frequencies.
     Direct light and shadows are modelled, interreflection is not. Raises InputRefused where no texel is seen.
@@ -80,6 +90,9 @@ def find_light(
     record(state)
     state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[0], record)
     cells, radiance = light_cells.refined(cells, state.radiance)
+    sun = outdoors.find_sun(traced, observed, normal) if outside else None
+    if sun is not None:
+        cells, radiance = outdoors.with_sun(cells, radiance, sun)
     bundled = light_solve.bundle(traced, observed, normal, cells, options)
     values = state.values
     for _ in range(3):
@@ -87,8 +100,12 @@ def find_light(
     state = light_solve.texels_under(bundled, radiance, values, 8)
     state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[1], record)
     progress(1.0)
-    light = light_cells.environment_of(cells, state.radiance)
-    return FoundLight(light, tuple(residuals), _maps(state, observed, texels))
+    radiance, beam = state.radiance, None
+    if sun is not None:
+        cells, radiance, beam = outdoors.without_sun(cells, radiance)
+    light = light_cells.environment_of(cells, radiance)
+    bright = beam if beam is not None and max(beam.irradiance) > 0 else None
+    return FoundLight(light, tuple(residuals), _maps(state, observed, texels), bright)
 
 
 def _observations(

@@ -5,7 +5,7 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
-from mistyle.jobs.plan import COVERED, SEEN, SHOWN
+from mistyle.solver.schedule import COVERED, SEEN, SHOWN
 from mistyle.solver.settings import joint_steps
 
 # A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not

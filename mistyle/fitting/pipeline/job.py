@@ -10,6 +10,7 @@ MATERIAL_STAGES = {
     "mesh": "read the mesh",
     "texels": "rasterise the UVs",
     "cameras": "place the cameras",
+    "photometry": "match the exposures",
     "pictures": "check the pictures",
     "light": "solve for the light",
     "recover": "fit the material",
@@ -34,5 +35,6 @@ class MaterialJob:
     masks: Path | None = None
     exposure: Path | None = None
     pictures: Path | None = None
+    albedo_of: Path | None = None
     redo_from: str | None = None
     overwrite: bool = False

@@ -23,6 +23,7 @@ from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
+from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
@@ -32,6 +33,7 @@ from mistyle.jobs.memory_budget import size_of
 from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
+from mistyle.solver.photometry.record import Photometry
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class MadeMaterial:
     recovered: Any
     measured: Measured
     folder: Path
+    photometry: Photometry | None = None
 
 
 def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
@@ -111,6 +114,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
+        whole, photometry = match_exposures(run, asset, whole, shots)
         captures, notes = average_pictures(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *notes))
         if job.lights == "unknown":
@@ -128,8 +132,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         recovered = replace(recovered, maps=tuple(maps))
         shown = replace(captures, cameras=whole.cameras)
         run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, shown))
-        results = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
-        progress.note(*asset.source.notes, *placed.notes, *recovered.notes, *old_report(job))
+        results = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder, photometry)
+        told = photometry.notes if photometry is not None else ()
+        progress.note(*asset.source.notes, *placed.notes, *told, *recovered.notes, *old_report(job))
         if s.report.detail != "none":
             inputs = [s.report, job.name]
             run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, results, progress, r))
@@ -139,7 +144,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 def inputs_of(job: MaterialJob) -> list[Path]:
     """Every input file and folder of the job."""
     lights = job.lights if isinstance(job.lights, Path) else None
-    paths = (job.references, lights, job.masks, job.exposure, job.pictures)
+    paths = (job.references, lights, job.masks, job.exposure, job.pictures, job.albedo_of)
     return [*input_files(job.mesh), *(path for path in paths if path is not None)]
 
 
@@ -235,7 +240,7 @@ def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> 
     """The captures at about the resolution of the texels, and notes about them."""
     average = run.job.settings.references.average
     folder = run.stage(
-        "pictures", ["texels", "cameras"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
+        "pictures", ["texels", "photometry"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
     )
     return read_averaged(folder, captures)
 
@@ -245,8 +250,36 @@ def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
     from mistyle.fitting.light.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
-    estimate = run.record("light", ["pictures"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))
-    return replace(captures, lights=tuple((estimate.light,) for _ in captures.cameras))
+    card = [run.job.albedo_of] if run.job.albedo_of is not None else []
+
+    def solved(report: Report) -> Any:
+        found = find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
+        return with_known_albedo(run, asset, captures, found)
+
+    estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)
+    if s.light.sun and estimate.sun is None:
+        run.progress.note("No direction of a sun explains the shading: the light is an environment alone.")
+    return replace(captures, lights=tuple(estimate.lights for _ in captures.cameras))
+
+
+def with_known_albedo(run: Run, asset: Asset, captures: Captures, found: Any) -> Any:
+    """The light in the scale of the surface that --albedo-of names; unchanged without one."""
+    from mistyle.fitting.light.gauge import gauged
+    from mistyle.io.cameras.camera_files import stem
+    from mistyle.io.read import read_picture
+    from mistyle.solver.photometry.record import at_size
+
+    mask, albedo = run.job.albedo_of, run.job.settings.light.albedo
+    if mask is None or albedo is None:
+        return found
+    named = [camera for camera in captures.cameras if camera.name == stem(mask.name)]
+    if not named:
+        names = ", ".join(camera.name for camera in captures.cameras[:3])
+        raise InputRefused(f"{mask}: found no picture of that name, expected one of {names}, ... Rename the mask.")
+    surface = at_size(read_picture(mask, "stored").rgb.mean(axis=-1) > 0.5, named[0].size)
+    found, factor = gauged(asset.mesh, found, named[0], surface, albedo)
+    run.progress.note(f"The known albedo of {mask.name} scaled all albedos by {', '.join(f'{v:.3g}' for v in factor)}.")
+    return found
 
 
 def lights_in_order(lights: Sequence[Lights]) -> list[int]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.fitting.report.photometry import photometry_steps
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report import overlays as report_overlays
 from mistyle.jobs.report.charts import Chart
@@ -30,6 +31,7 @@ from mistyle.jobs.report.turntable import write_turn
 from mistyle.jobs.run_record import earlier, merged_peaks, merged_seconds, report_files, write_record
 from mistyle.jobs.stages import Run
 from mistyle.jobs.versions import peak_gb, versions
+from mistyle.solver.photometry.record import as_json
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "seen_share": ("share of the covered texels that at least one reference sees", "higher"),
@@ -163,7 +165,7 @@ def steps(results: Any) -> tuple[Step, ...]:
         ),
         columns=2,
     )
-    return (compare, curves, bars, trust)
+    return (compare, *photometry_steps(results), curves, bars, trust)
 
 
 def curve_charts(trace: dict[str, list[float]]) -> list[Chart]:
@@ -243,6 +245,7 @@ def write_summary(results: Any, run: Run) -> dict[str, Any]:
                 strict=True,
             )
         ],
+        **({} if results.photometry is None else {"photometry": as_json(results.photometry)}),
         "seed": job.settings.seed,
         "settings": job.settings.model_dump(mode="json"),
         "versions": versions(),

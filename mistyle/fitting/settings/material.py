@@ -47,6 +47,30 @@ class ReferenceSettings(BaseModel):
     )
 
 
+class PhotometrySettings(BaseModel):
+    """Solving for the pictures' exposure, white balance and vignetting."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mode: Literal["auto", "none", "exposure", "full"] = Field(
+        default="auto",
+        description="solve for each picture's exposure, or (full) also its white balance, the vignetting of all and "
+        "veiling light; auto: full for 8-bit pictures under unknown light without given exposures, else none",
+    )
+    exif: bool = Field(default=True, description="use EXIF's exposure time, f-number and ISO speed as a prior")
+
+
+class LightSettings(BaseModel):
+    """Solving for an unknown light."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sun: bool = Field(default=False, description="look for a sun beside the environment (--light outdoors)")
+    albedo: tuple[float, float, float] | None = Field(
+        default=None, description="albedo (linear) of the surface that --albedo-of masks; it fixes the light's scale"
+    )
+
+
 class MaterialSettings(BaseModel):
     """The settings of one fit of a material to pictures."""
 
@@ -80,6 +104,8 @@ class MaterialSettings(BaseModel):
     )
     read: ReadSettings = ReadSettings()
     references: ReferenceSettings = ReferenceSettings()
+    photometry: PhotometrySettings = PhotometrySettings()
+    light: LightSettings = LightSettings()
     atlas: AtlasSettings = AtlasSettings(size=1024)
     recover: RecoverSettings = RecoverSettings()
     report: ReportSettings = ReportSettings(frames=12, resolution=384)

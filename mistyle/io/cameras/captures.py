@@ -1,10 +1,10 @@
 """Reader of a fit's references: photographs or renders with known cameras.
 
-A folder with our `camera.json` (io/cameras/camera_files.py), a NeRF/Blender `transforms.json` with its pictures, or a
-COLMAP model with its `images`. EXR pictures are linear and, where they have an A channel, premultiplied by it; all
-others are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture becomes linear Rec.709 radiance seen by a
-pinhole camera with square pixels: encoded values go through the exact sRGB curve, lens distortion and unequal focal
-lengths are removed by resampling.
+A folder with our `camera.json` (io/cameras/camera_files.py), a NeRF/Blender `transforms.json` with its pictures, a
+COLMAP model with its `images`, or Meshroom's `cameras.sfm` (io/cameras/sfm.py). EXR pictures are linear and, where they
+have an A channel, premultiplied by it; all others are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture
+becomes linear Rec.709 radiance seen by a pinhole camera with square pixels: encoded values go through the exact sRGB
+curve, lens distortion and unequal focal lengths are removed by resampling.
 
 A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py):
 `CapturedPicture.pixels`, for both the picture and the mask of a view.
@@ -46,6 +46,7 @@ from mistyle.io.cameras.picture_files import (
     named_mask,
     picture_folder,
 )
+from mistyle.io.cameras.sfm import is_sfm, read_sfm
 from mistyle.io.cameras.views import picture_of_view
 from mistyle.io.read import (
     read_colmap,
@@ -59,7 +60,7 @@ from mistyle.io.read import (
 )
 from mistyle.io.sandbox.bounds import inside, refuse
 
-EXPECTED = "a folder with camera.json, transforms.json or a COLMAP model (sparse/0), or one of these files"
+EXPECTED = "a folder with camera.json, transforms.json, a COLMAP model (sparse/0) or cameras.sfm, or one of these files"
 KEPT = 2  # pictures held decoded
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 
@@ -141,12 +142,18 @@ def read_shots(
         folder = images_folder(Path(path), file) if kind == "colmap" and elsewhere is None else file.parent
 
         def place(name: str) -> Path:
-            return find(folder, name, file) if elsewhere is None else find_elsewhere(elsewhere, name)
+            if elsewhere is None and kind != "sfm":
+                return find(folder, name, file)
+            # Meshroom names pictures by where they lay on the machine of the reconstruction.
+            return find_elsewhere(elsewhere or folder, name)
 
         def size(name: str) -> tuple[int, int]:
             return read_size(place(name), "stored")
 
-        frames = read_colmap(file) if kind == "colmap" else read_frames(file, size)
+        if kind == "colmap":
+            frames = read_colmap(file)
+        else:
+            frames = read_sfm(file) if kind == "sfm" else read_frames(file, size)
         # The user's masks replace those that frames name.
         homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
         named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
@@ -268,10 +275,11 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
     return tuple(notes)
 
 
-def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap"], Path]:
+def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm"], Path]:
     """The kind of references at `path`, and the file (COLMAP: the model's folder) with the cameras."""
     if path.is_dir():
         camera_files = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
+        camera_files += sorted(path.glob("*.sfm"))
         model = find_model(path)
         if not camera_files and model is not None:
             return "colmap", model
@@ -280,9 +288,10 @@ def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap"],
         path = camera_files[0]
     elif not path.is_file():
         raise refuse(path, "nothing", EXPECTED, "Check the path")
-    if path.suffix.lower() != ".json":
+    if path.suffix.lower() not in (".json", ".sfm"):
         raise refuse(path, f"a file ending in '{path.suffix}'", EXPECTED, "Hand in the folder with the cameras")
-    return ("transforms" if "frames" in read_json(path) else "camera.json"), path
+    tree = read_json(path)
+    return ("sfm" if is_sfm(tree) else "transforms" if "frames" in tree else "camera.json"), path
 
 
 def _home(path: Path) -> Path:

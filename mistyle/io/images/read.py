@@ -1,9 +1,11 @@
 """Decoder of pictures and textures: headers first, sizes bounded, plain arrays as results."""
 
 import io
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ EXPECTED = "a PNG, JPEG, WebP, TIFF, BMP, GIF or TGA picture"
 CONVERT = "Save it as PNG or JPEG and try again"
 MAX_PICTURE_BYTES = 512 << 20
 ORIENTATION = 0x0112  # the tag of EXIF and TIFF: 1 upright, 2 mirrored, 3 turned by 180 degrees, ... 8
+EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO_SPEED = 0x8769, 0x829A, 0x829D, 0x8827
 BITS_PER_SAMPLE, PLANES, EXTRA_SAMPLES, ASSOCIATED = 258, 284, 338, 1  # TIFF 6.0; 1: colours are multiplied by alpha
 UNDONE_BY = {6: 8, 8: 6}  # the other orientations are their own inverses
 
@@ -80,6 +83,26 @@ def size_of_picture(path: Path) -> tuple[int, int, int]:
     swapped = image.format == "TIFF" and image.tag_v2.get(ORIENTATION) in range(5, 9)
     height, width = (image.width, image.height) if swapped else (image.height, image.width)
     return height, width, _orientation(image)
+
+
+def exposure_of_picture(path: Path) -> tuple[float, float, float]:
+    """See `read_exposure` in io/read.py."""
+    image, _ = _open(read_bytes(path, MAX_PICTURE_BYTES), str(path))
+    try:
+        tags = image.getexif().get_ifd(EXIF_IFD)
+        values = [_number(tags.get(tag)) for tag in (EXPOSURE_TIME, F_NUMBER, ISO_SPEED)]
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, ZeroDivisionError):
+        values = [math.nan] * 3
+    return values[0], values[1], values[2]
+
+
+def _number(value: Any) -> float:
+    """An EXIF value (the first of several) as a positive number, else NaN."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return math.nan
+    return number if math.isfinite(number) and number > 0 else math.nan
 
 
 def texture(data: bytes, where: str, budget: Budget) -> Shaped[np.ndarray, "h w 3"]:
@@ -193,15 +216,17 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
     ):
         if head.startswith(mark) or (mark == b"<svg" and b"<svg" in head):
             raise refuse(where, name, EXPECTED, "Export it as PNG from the program that made it")
-    if data[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1"):
-        raise refuse(where, "a HEIC photograph", EXPECTED, CONVERT)
+    heic = data[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1")
+    if heic and not _heic_decoder():
+        fix = "Export it as JPEG, or install a decoder beside mistyle (pip install pillow-heif; its codec is GPL)"
+        raise refuse(where, "a HEIC photograph", EXPECTED, fix)
     if data[:4] == b"\x76\x2f\x31\x01" or head.startswith(b"#?r"):
         raise refuse(where, "a high-dynamic-range picture", EXPECTED, "Tone-map it and save it as PNG")
     Image.init()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(io.BytesIO(data), formats=[f for f in FORMATS if f in Image.OPEN])
+            image = Image.open(io.BytesIO(data), formats=[f for f in (*FORMATS, *["HEIF"] * heic) if f in Image.OPEN])
             several = bool(getattr(image, "is_animated", False))  # counting the frames may take minutes
     except Image.DecompressionBombError as error:
         raise _too_large(where, "far too many pixels") from error
@@ -218,6 +243,16 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         [f"Only the {first_parts.get(str(image.format), 'first frame of the animation')} was read."] if several else []
     )
     return image, notes
+
+
+def _heic_decoder() -> bool:
+    """Whether the user has installed pillow-heif; it is then registered with Pillow."""
+    try:
+        pillow_heif: Any = import_module("pillow_heif")
+        pillow_heif.register_heif_opener()
+    except (ImportError, OSError):
+        return False
+    return True
 
 
 def _too_large(where: str, found: str) -> InputRefused:

@@ -112,6 +112,11 @@ def picture(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.ndar
     return pictures.read_pixels(path, pixels)
 
 
+def exposure(path: Path) -> tuple[float, float, float]:
+    nothing = (float("nan"),) * 3
+    return nothing if path.suffix.lower() == ".exr" else pictures.exposure_of_picture(path)
+
+
 def size(path: Path) -> tuple[int, int, int]:
     if not path.is_file():
         raise refuse(path, "nothing", "a picture", "Check the path")
@@ -237,6 +242,7 @@ TASKS: dict[str, Callable[..., Any]] = {
     "radiance": radiance,
     "picture": picture,
     "shrink": shrink,
+    "exposure": exposure,
     "size": size,
     "npy": npy,
     "json": json,

@@ -107,7 +107,7 @@ def collect_observations(
         camera = captures.cameras[group[0]]
         beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
         seen, corners = trace_gbuffer(traced, camera, beams), trace_gbuffer(traced, of_corners(camera), beams)
-        pure = _unmixed_pixels(camera, seen, corners)
+        pure = unmixed_pixels(camera, seen, corners)
         visible = _visible(camera, seen, pure, (position, normal, size), options.facing)
         any_light, first = np.zeros(len(visible.texel), bool), 0
         for k in group:
@@ -167,7 +167,7 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
 
 
-def _unmixed_pixels(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "h w"]:
+def unmixed_pixels(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "h w"]:
     """Pixels whose corners show the same surface as their centre: no silhouette or crease crosses them."""
     p, n = seen.position, seen.normal
     away = camera.position.astype(np.float32) - p

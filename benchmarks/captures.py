@@ -1,0 +1,307 @@
+"""Photographs as they come: `python -m benchmarks.captures [--quick] [--json FILE] [--only castle|phone] [--keep DIR]`
+
+`castle`: eleven JPEGs of a façade (MISTYLE_DATA/photographs/castle) with a COLMAP model, a mesh in another frame, sky,
+trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out 2 --preset draft`:
+
+    castle.seconds, castle.plan_ratio   of the fit, and over the seconds of --dry-run
+    castle.exposure_r                   correlation of log exposures, solved without EXIF, with its log shutter times
+    castle.psnr_held_out                of the held-out pictures (sRGB, peak 1, valid pixels of the mesh)
+    castle.psnr_held_out_texture        the same for the fitted pictures projected as an unlit texture: each texel's
+                                        median over the pictures that show it, at the same exposures and pixels
+    castle.shadow_step_ratio            mean |log albedo| step across the borders of shadows by the light's brightest
+                                        direction, over that of equally distant texels elsewhere
+    castle.shadow_pairs                 the number of pairs across such borders
+
+`phone`: two assets under a sky, drawn by Mitsuba's `path`, as 8-bit JPEGs with random exposures (±1 EV), white balances
+(±10 %) and a vignetting of 30 %: `phone.relight_psnr_l`, `phone.albedo_psnr_scaled` (factor per channel),
+`phone.exposure_error` (largest error of a gain, relative), `phone.seconds`; means over the assets, the worst exposure.
+
+--quick fits textures of 256², texel by texel alone; the phone's pictures have 160 pixels a side.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from benchmarks import recovery_pictures as drawing
+from benchmarks.common import finish, parser
+from benchmarks.material_metrics import align_channels, map_errors, orb_mask, psnr_ldr
+from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, seen, truth
+from mistyle.atlas.texels import rasterise
+from mistyle.core.camera import pixel_centres
+from mistyle.core.capture import Captures, subset
+from mistyle.core.image import bilinear, luminance, srgb_from_linear
+from mistyle.core.light import Ambient, Environment, environment_directions
+from mistyle.core.maps import Texels
+from mistyle.fitting.pipeline.photometry import exif_exposure
+from mistyle.fitting.pipeline.pictures import read_averaged
+from mistyle.io.cameras.camera_files import transforms
+from mistyle.io.cameras.captures import read_captures, read_shots
+from mistyle.io.read import read_hdr
+from mistyle.io.read_mesh import read_mesh
+from mistyle.io.store.records import load_record
+from mistyle.measure.metrics import psnr
+from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
+from mistyle.solver.photometry.record import coordinates, corrected, fall_terms
+from mistyle.solver.photometry.solve import solve_photometry
+from mistyle.solver.texels.gbuffer import open_sky
+from mistyle.solver.texels.observations import ObservationOptions, collect_observations
+
+PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"
+QUICK = ["--atlas", 256, "--set", "recover.solver=texels", "--set", "recover.bounces=0"]
+STEP = 3  # texels between the two of a pair
+PHONES, SKY = ("suzanne", "avocado"), "kiara_1_dawn_1k.hdr"
+VIEWS, FALL = 24, np.array([-0.25, -0.1, np.log(0.7) + 0.35])
+
+
+@dataclass(frozen=True)
+class CastleRun:
+    """A run folder of the castle: mesh, atlas, corrected captures at the fit's resolution, held-out pictures' indices,
+    the solved light and the fitted maps."""
+
+    traced: Tracer
+    texels: Texels
+    captures: Captures
+    held: tuple[int, ...]
+    light: Any
+    recovered: Any
+
+
+def main() -> None:
+    options = parser(__doc__ or "")
+    options.add_argument("--only", choices=("castle", "phone"), action="append", help="only this part (repeatable)")
+    options.add_argument("--keep", type=Path, help="folder for the runs, to look at afterwards")
+    chosen = options.parse_args()
+    figures: dict[str, float] = {}
+    with TemporaryDirectory() as scratch:
+        place = chosen.keep or Path(scratch)
+        if "castle" in (chosen.only or ["castle"]):
+            figures |= castle(place / "castle", chosen.quick)
+        if "phone" in (chosen.only or ["phone"]):
+            figures |= phone(place / "phone", chosen.quick)
+    finish(figures, chosen.json)
+
+
+def castle(out: Path, quick: bool) -> dict[str, float]:
+    """Fit the castle into `out` and measure it."""
+    folder = data_folder() / "photographs" / "castle"
+    words = ["fit", folder / "scene_mesh.ply", folder, "-o", out, "--align", "--light", "unknown", "--hold-out", 2]
+    words += ["--preset", "draft", *(QUICK if quick else [])]
+    plan = _mistyle(*words, "--dry-run")
+    start = time.perf_counter()
+    summary = _mistyle(*words)
+    figures = {"castle.seconds": time.perf_counter() - start}
+    figures["castle.plan_ratio"] = figures["castle.seconds"] / plan["seconds"]
+    run = castle_run(folder, out)
+    figures["castle.exposure_r"] = exposure_r(folder, run)
+    figures["castle.psnr_held_out"] = summary["figures"]["psnr_held_out"]
+    figures["castle.psnr_held_out_texture"] = texture_psnr(run)
+    steps = shadow_steps(run)
+    figures["castle.shadow_step_ratio"], figures["castle.shadow_pairs"] = steps
+    return figures
+
+
+def castle_run(folder: Path, out: Path) -> CastleRun:
+    """The records of a finished run."""
+    asset, record = read_mesh(folder / "scene_mesh.ply"), json.loads((out / "run.json").read_text())
+    work = out / "work"
+    cameras = load_record(work / "cameras" / "record").cameras
+    captures = replace(read_captures(folder, lights="unknown"), cameras=cameras)
+    captures = corrected(captures, load_record(work / "photometry" / "record"))
+    captures, _ = read_averaged(work / "pictures", captures)
+    held = tuple(k for k, picture in enumerate(record["pictures"]) if picture["held_out"])
+    recovered = load_record(work / "recover" / "record")
+    size = recovered.maps[0].roughness.shape[0]
+    light = load_record(work / "light" / "record").light
+    return CastleRun(tracer(asset.mesh), rasterise(asset.mesh, 0, size), captures, held, light, recovered)
+
+
+def exposure_r(folder: Path, run: CastleRun) -> float:
+    """The correlation of solved and stated log exposures; EXIF is read for the comparison only."""
+    captures = replace(read_captures(folder, lights="unknown"), cameras=_unaveraged(folder, run))
+    solved = solve_photometry(run.traced, captures).exposure
+    stated = [exif_exposure(shot.picture) for shot in read_shots(folder)]
+    return float(np.corrcoef(solved, stated)[0, 1])
+
+
+def _unaveraged(folder: Path, run: CastleRun) -> tuple[Any, ...]:
+    """The aligned cameras at the size of the photographs."""
+    whole = read_captures(folder, lights="unknown").cameras
+    pairs = zip(whole, run.captures.cameras, strict=True)
+    return tuple(replace(camera, world_from_cam=placed.world_from_cam) for camera, placed in pairs)
+
+
+def texture_psnr(run: CastleRun) -> float:
+    """Mean PSNR of the held-out pictures, predicted by the median of the others as an unlit texture."""
+    fitted = [k for k in range(len(run.captures)) if k not in run.held]
+    chosen = subset(run.captures, fitted)
+    lit = replace(chosen, lights=((Ambient((1.0, 1.0, 1.0)),),) * len(fitted))
+    observed = collect_observations(run.traced, [run.texels], lit, None, ObservationOptions(skies=False))
+    texture = np.zeros((*run.texels.covered.shape, 3), np.float32)
+    values, start = observed.observations.rgb, observed.observations.start
+    rows = np.array([
+        np.median(values[low:high], axis=0) if high > low else np.zeros(3)
+        for low, high in zip(start[:-1], start[1:], strict=True)
+    ])  # fmt: skip
+    texture.reshape(-1, 3)[observed.texel] = rows
+    known = np.zeros(run.texels.covered.shape, bool)
+    known.ravel()[observed.texel] = np.diff(start) > 0
+    texture = _filled(texture, known)
+    return float(np.mean([_texture_error(run, texture, k) for k in run.held]))
+
+
+def _filled(texture: np.ndarray, known: np.ndarray) -> np.ndarray:
+    from mistyle.core.image import nearest_fill
+
+    return nearest_fill(texture, known)
+
+
+def _texture_error(run: CastleRun, texture: Float[np.ndarray, "h w 3"], k: int) -> float:
+    """PSNR of picture k, predicted at four points a pixel, over the pixels that `measure` counts."""
+    camera = run.captures.cameras[k]
+    height, width = camera.size
+    fine = replace(camera, focal=2 * camera.focal, centre=(2 * camera.centre[0], 2 * camera.centre[1]),
+                   size=(2 * height, 2 * width))  # fmt: skip
+    hits, side = gbuffer(run.traced, fine), len(texture)
+    px = np.stack([hits.uv[..., 0] * side, (1 - hits.uv[..., 1]) * side], axis=-1).reshape(-1, 2)
+    drawn = bilinear(texture, px).reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+    rgb, valid = run.captures.load(k)
+    valid = valid & hits.mask.reshape(height, 2, width, 2).all(axis=(1, 3))
+    return psnr(srgb_from_linear(rgb)[valid], srgb_from_linear(drawn)[valid])
+
+
+def shadow_steps(run: CastleRun) -> tuple[float, float]:
+    """The ratio of albedo steps across shadow borders to others, and the number of pairs across borders."""
+    sun = brightest(run.light)
+    covered = run.texels.covered & run.recovered.maps[0].known
+    position, normal = run.texels.position[covered], run.texels.normal[covered]
+    free = open_sky(run.traced, position, normal, sun[None].astype(np.float32))[:, 0] & 1
+    lit = np.zeros(covered.shape, bool)
+    lit[covered] = (free == 1) & (normal @ sun > 0.1)
+    towards = np.zeros(covered.shape, bool)
+    towards[covered] = normal @ sun > 0.1
+    value = np.log(np.maximum(luminance(run.recovered.maps[0].albedo), 1e-3))
+    border, other = [], []
+    for axis in (0, 1):
+        near, far = (np.take(np.arange(covered.shape[axis]), range(*cut)) for cut in _cuts(covered.shape[axis]))
+
+        def pair(field: np.ndarray, near=near, far=far, axis=axis) -> tuple[np.ndarray, np.ndarray]:
+            return np.take(field, near, axis=axis), np.take(field, far, axis=axis)
+
+        a, b = pair(run.texels.position)
+        size = np.median(np.linalg.norm(a - b, axis=-1)[np.logical_and(*pair(covered))])
+        joined = np.logical_and(*pair(towards)) & np.logical_and(*pair(covered))
+        joined &= np.linalg.norm(a - b, axis=-1) < 2 * size
+        same = (np.stack(pair(run.texels.normal)).prod(axis=0)).sum(axis=-1) > 0.95
+        step, differs = np.abs(np.subtract(*pair(value))), np.not_equal(*pair(lit))
+        border.append(step[joined & same & differs])
+        other.append(step[joined & same & ~differs])
+    across, within = np.concatenate(border), np.concatenate(other)
+    ratio = float(across.mean() / within.mean()) if len(across) and len(within) else 0.0
+    return ratio, float(len(across))
+
+
+def _cuts(size: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (0, size - STEP), (STEP, size)
+
+
+def brightest(light: Environment) -> Float[np.ndarray, "3"]:
+    """The direction of an environment's brightest pixel."""
+    towards = environment_directions(*light.radiance.shape[:2]).reshape(-1, 3)
+    return towards[int(luminance(light.radiance).argmax())]
+
+
+def phone(place: Path, quick: bool) -> dict[str, float]:
+    """Both assets photographed, fitted and relit."""
+    rows = [_phone(name, place / name, 160 if quick else 320, quick) for name in PHONES]
+    keys = ("relight_psnr_l", "albedo_psnr_scaled", "seconds")
+    figures = {f"phone.{key}": float(np.mean([row[key] for row in rows])) for key in keys}
+    figures["phone.exposure_error"] = max(row["exposure_error"] for row in rows)
+    for name, row in zip(PHONES, rows, strict=True):
+        print(name, {key: round(value, 3) for key, value in row.items()}, file=sys.stderr, flush=True)
+    return figures
+
+
+def _phone(name: str, place: Path, side: int, quick: bool) -> dict[str, float]:
+    cameras = [replace(c, focal=1.2 * c.focal) for c in drawing.fibonacci(VIEWS, side)]
+    file = find_asset(name, data_folder())
+    known = truth(file, name, cameras[0], ASSETS[name][1])
+    radiance = read_hdr(data_folder() / "hdri" / SKY)
+    sky = Environment(radiance, scale=drawing.HDRI_MEAN / float(radiance.mean()), file=SKY)
+    shots = [drawing.Shot(camera, (sky,)) for camera in cameras]
+    pictures = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=16 if quick else 64)
+    gain = photograph(place / "shots", shots, pictures, np.random.default_rng(len(name)))
+    size = len(known.texels[0].covered)
+    words = ["fit", file, place / "shots", "-o", place / "out", "--masks", place / "shots" / "masks"]
+    words += ["--light", "unknown", "--preset", "draft", *(QUICK if quick else []), "--atlas", size]
+    start = time.perf_counter()
+    _mistyle(*words)
+    result = {"seconds": time.perf_counter() - start}
+    work = place / "out" / "work"
+    found, recovered = load_record(work / "photometry" / "record"), load_record(work / "recover" / "record")
+    solved = found.exposure[:, None] + found.balance
+    result["exposure_error"] = float(np.abs(np.expm1(solved - gain)).max())
+    weights = [area * (count >= 3) for area, count in zip(known.areas, seen(known, cameras), strict=True)]
+    result["albedo_psnr_scaled"] = map_errors(known.maps, recovered.maps, weights).albedo_psnr_aligned
+    result["relight_psnr_l"] = relit(known, recovered.maps, side, quick)
+    return result
+
+
+def photograph(
+    folder: Path, shots: list[drawing.Shot], pictures: list[np.ndarray], rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """Write JPEGs with masks and cameras as a phone takes them; returns their log gains in the gauge of a fit."""
+    (folder / "masks").mkdir(parents=True, exist_ok=True)
+    n = len(shots)
+    exposure, balance = rng.uniform(-1, 1, n) * np.log(2), rng.uniform(np.log(0.9), np.log(1.1), (n, 3))
+    balance -= balance.mean(axis=1, keepdims=True)
+    inside = np.concatenate([p[..., :3][p[..., 3] > 0.99] for p in pictures])
+    level = 0.25 / float(np.quantile(inside, 0.9))
+    for k, (shot, picture) in enumerate(zip(shots, pictures, strict=True)):
+        x = coordinates(shot.camera, pixel_centres(shot.camera.size))
+        taken = level * picture[..., :3] * np.exp(exposure[k] + balance[k] + (fall_terms(x) @ FALL)[..., None])
+        encoded = (255 * srgb_from_linear(np.clip(taken, 0, 1).astype(np.float32)) + 0.5).astype(np.uint8)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+        cv2.imwrite(str(folder / f"{shot.camera.name}.jpg"), encoded[..., ::-1], quality)
+        mask = (255 * (picture[..., 3] > 0.999)).astype(np.uint8)
+        cv2.imwrite(str(folder / "masks" / f"{shot.camera.name}.png"), mask)
+    names = [f"{shot.camera.name}.jpg" for shot in shots]
+    (folder / "transforms.json").write_text(json.dumps(transforms([shot.camera for shot in shots], names)))
+    balance -= balance.mean(axis=0)
+    return (exposure - exposure.mean())[:, None] + balance
+
+
+def relit(known: Truth, maps: Any, side: int, quick: bool) -> float:
+    """Mean PSNR-L under the four unseen lights of `recovery_pictures.unseen`, with a factor per channel."""
+    hdri, errors = data_folder() / "hdri" / "studio_small_03_1k.hdr", []
+    for shots in drawing.unseen(hdri, side, 2 if quick else 4).values():
+        spp = 16 if quick else 64
+        true = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=spp)
+        mine = drawing.render(known.mesh, maps, shots, frame="mikkt", spp=spp)
+        for a, b in zip(true, mine, strict=True):
+            mask = orb_mask(a[..., 3])
+            errors.append(psnr_ldr(a[..., :3], align_channels(a[..., :3], b[..., :3], mask), mask))
+    return float(np.mean(errors))
+
+
+def _mistyle(*words: Any) -> Mapping[str, Any]:
+    command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ)
+    if done.returncode != 0:
+        raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}")
+    return json.loads(done.stdout)
+
+
+if __name__ == "__main__":
+    main()

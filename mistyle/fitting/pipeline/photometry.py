@@ -1,0 +1,86 @@
+"""The stage `photometry` of `mistyle fit`: exposures of the pictures, solved and removed."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from mistyle.core.asset import Asset
+from mistyle.core.capture import Captures
+from mistyle.fitting.pipeline.job import MaterialJob
+from mistyle.io.read import read_exposure
+from mistyle.jobs.progress import Report
+from mistyle.jobs.stages import Run
+from mistyle.solver.photometry.record import Photometry, corrected, unchanged
+
+LINEAR = (".exr", ".hdr")
+
+
+def photometry_mode(job: MaterialJob, shots: Sequence[Any]) -> Literal["none", "exposure", "full"]:
+    """The mode of a job, with "auto" decided."""
+    chosen = job.settings.photometry.mode
+    if chosen != "auto":
+        return chosen
+    encoded = all(shot.picture.suffix.lower() not in LINEAR for shot in shots)
+    return "full" if encoded and job.exposure is None and job.lights == "unknown" else "none"
+
+
+def match_exposures(
+    run: Run, asset: Asset, captures: Captures, shots: Sequence[Any]
+) -> tuple[Captures, Photometry | None]:
+    """The captures without their exposures, and the stage's result; None where it was left out."""
+    job = run.job
+    mode = photometry_mode(job, shots)
+    if mode == "none":
+        run.skip(["photometry"], ["cameras"])
+        return captures, None
+    found = run.record(
+        "photometry", ["cameras"], [mode, job.settings.photometry.exif],
+        lambda report: _solved(job, asset, captures, shots, report),
+    )  # fmt: skip
+    for text in found.notes:
+        run.progress.say(text)
+    return corrected(captures, found), found
+
+
+def _solved(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Photometry:
+    from mistyle.render.mitsuba.draw import tracer
+    from mistyle.solver.photometry.solve import solve_photometry
+
+    if len(captures) < 2:
+        return unchanged(captures, ("Photometry: a single picture has no exposure relative to others.",))
+    settings = job.settings.photometry
+    exif = [exif_exposure(shot.picture) for shot in shots] if settings.exif else []
+    known = sum(math.isfinite(value) for value in exif)
+    full = photometry_mode(job, shots) == "full"
+    found = solve_photometry(
+        tracer(asset.mesh), captures, full=full, exif=exif if known > 1 else (), seed=job.settings.seed, progress=report
+    )
+    return replace(found, notes=(*found.notes, *summary(found, known)))
+
+
+def exif_exposure(picture: Any) -> float:
+    """Log of seconds · ISO / f-number² by EXIF, NaN where the time is missing. A missing ISO speed or f-number is
+    taken to be that of the other pictures."""
+    seconds, f_number, iso = read_exposure(picture)
+    value = math.log(seconds) if math.isfinite(seconds) else math.nan
+    value += math.log(iso) if math.isfinite(iso) else 0.0
+    return value - (2 * math.log(f_number) if math.isfinite(f_number) else 0.0)
+
+
+def summary(found: Photometry, known: int) -> tuple[str, ...]:
+    """A sentence with the solved numbers; none where nothing was corrected."""
+    if not found.applied:
+        return ()
+    stops = found.exposure / np.log(2)
+    veiled = [name for name, row in zip(found.names, found.veil, strict=True) if np.abs(row).max() > 0]
+    veil = " Veiling light (flare, haze) was subtracted." if veiled else ""
+    prior = f" EXIF of {known} pictures was the prior." if known > 1 else ""
+    return (
+        f"Photometry: exposures from {stops.min():+.2f} to {stops.max():+.2f} EV, white balance within "
+        f"{100 * (np.exp(np.abs(found.balance).max()) - 1):.0f} %, corners at {100 * found.corner:.0f} % of the centre;"
+        f" a point differs between pictures by {100 * found.spread[1]:.0f} % instead of {100 * found.spread[0]:.0f} %."
+        + veil + prior,
+    )  # fmt: skip

@@ -1,0 +1,141 @@
+"""Photometry of pictures: what was done to them is found, from pictures of a textured shape with soft highlights."""
+
+import numpy as np
+import pytest
+from helpers import ROOT
+
+from benchmarks import recovery_pictures as drawing
+from mistyle.core.camera import pixel_centres
+from mistyle.core.capture import Captures, in_memory
+from mistyle.core.image import linear_from_srgb, srgb_from_linear
+from mistyle.core.light import Environment
+from mistyle.core.maps import flat_maps
+from mistyle.io.read_mesh import read_mesh
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+from mistyle.render.mitsuba.draw import tracer
+from mistyle.solver.photometry.ignored import ignored_cells
+from mistyle.solver.photometry.record import at_size, coordinates, corrected, fall_terms
+from mistyle.solver.photometry.solve import solve_photometry
+
+SIDE, VIEWS, TEXELS = 128, 24, 128
+FALL = np.array([-0.25, -0.1, np.log(0.7) + 0.35])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A tracer, cameras, and linear pictures of a mesh with a textured, slightly glossy material."""
+    mesh = read_mesh(ROOT / "scenes" / "demo.obj").mesh
+    rng = np.random.default_rng(3)
+    maps = [flat_maps(TEXELS, 0.5, roughness=0.6) for _ in mesh.parts]
+    for each in maps:
+        coarse = rng.uniform(0.15, 0.7, (32, 32, 3)).astype(np.float32)
+        each.albedo[...] = np.kron(coarse, np.ones((TEXELS // 32, TEXELS // 32, 1), np.float32))
+    rows, columns = np.mgrid[0:32, 0:64]
+    sun = 6 * np.exp(-(((rows - 9) / 5.0) ** 2) - ((columns - 40) / 7.0) ** 2)
+    sky = Environment((0.5 + sun[..., None] * np.array([1.0, 0.85, 0.6])).astype(np.float32))
+    cameras, traced = drawing.fibonacci(VIEWS, SIDE), tracer(mesh)
+    blank = in_memory(cameras, [(sky,)] * VIEWS, [np.zeros((SIDE, SIDE, 3), np.float32)] * VIEWS)
+    renderer = MaterialRenderer(traced, blank, [(TEXELS, TEXELS)] * len(maps), RenderOptions(subsamples=4, memory=0))
+    pictures = [renderer.image_and_coverage(pack(maps), k) for k in range(VIEWS)]
+    level = 0.3 / np.quantile(np.concatenate([p[c > 0.99] for p, c in pictures]), 0.9)
+    return traced, cameras, [(level * p, c > 0.999) for p, c in pictures]
+
+
+def photographed(scene, gain: np.ndarray, fall: np.ndarray, veil: np.ndarray | None = None) -> Captures:
+    """8-bit pictures with these log gains and fall-off, and additive light per picture."""
+    _, cameras, pictures = scene
+    result, masks = [], []
+    for k, (picture, mask) in enumerate(pictures):
+        radiance = picture if veil is None else picture + veil[k]
+        x = coordinates(cameras[k], pixel_centres(cameras[k].size))
+        taken = radiance * np.exp(gain[k] + (fall_terms(x) @ fall)[..., None])
+        bits = np.round(255 * srgb_from_linear(np.clip(taken, 0, 1).astype(np.float32)))
+        result.append(linear_from_srgb((bits / 255).astype(np.float32)))
+        masks.append(mask & (bits < 255).all(axis=-1))
+    return in_memory(cameras, [()] * len(cameras), result, masks)
+
+
+def gains(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Exposures of ±1 EV with mean 0, and balances of ±10 % in the gauge."""
+    rng = np.random.default_rng(seed)
+    exposure = rng.uniform(-1, 1, VIEWS) * np.log(2)
+    balance = rng.uniform(np.log(0.9), np.log(1.1), (VIEWS, 3))
+    balance -= balance.mean(axis=1, keepdims=True)
+    return exposure - exposure.mean(), balance - balance.mean(axis=0)
+
+
+@pytest.fixture(scope="module")
+def found(scene):
+    exposure, balance = gains(1)
+    captures = photographed(scene, exposure[:, None] + balance, FALL)
+    return captures, solve_photometry(scene[0], captures)
+
+
+def test_exposure_white_balance_and_vignetting_are_found_within_two_percent(found):
+    _, solved = found
+    exposure, balance = gains(1)
+    assert np.abs(np.expm1(solved.exposure - exposure)).max() < 0.02
+    assert np.abs(np.expm1(solved.balance - balance)).max() < 0.02
+    seen = np.linspace(0, 0.6, 7)[:, None] * np.array([[1.0, 0.0]])  # the object does not reach the corners
+    assert np.abs(np.expm1(fall_terms(seen) @ (solved.vignetting - FALL))).max() < 0.02
+    assert solved.applied and not np.abs(solved.veil).max()
+    assert solved.spread[1] < 0.2 * solved.spread[0]
+
+
+def test_the_gauge_is_mean_exposure_zero_and_neutral_balance(found):
+    _, solved = found
+    assert solved.exposure.mean() == pytest.approx(0, abs=1e-9)
+    assert np.abs(solved.balance.mean(axis=0)).max() < 1e-9 and np.abs(solved.balance.mean(axis=1)).max() < 1e-9
+
+
+def test_corrected_pictures_equal_clean_ones(scene, found):
+    captures, solved = found
+    clean = photographed(scene, np.zeros((VIEWS, 3)), np.zeros(3))
+    ratios = []
+    for k in range(VIEWS):
+        (mine, valid), (true, also) = corrected(captures, solved).load(k), clean.load(k)
+        both = valid & also & (true.min(axis=-1) > 0.05)
+        ratios.append(np.log(mine[both] / true[both]))
+    assert np.quantile(np.abs(np.concatenate(ratios)), 0.95) < 0.04
+
+
+def test_pictures_that_agree_are_left_as_they_are(scene):
+    captures = photographed(scene, np.zeros((VIEWS, 3)), np.zeros(3))
+    solved = solve_photometry(scene[0], captures)
+    assert not solved.applied and "nothing was corrected" in solved.notes[-1]
+    assert (corrected(captures, solved).load(0)[0] == captures.load(0)[0]).all()
+
+
+def test_contrast_finds_exposures_under_veiling_light(scene):
+    exposure, balance = gains(2)
+    veil = np.zeros((VIEWS, 1, 1, 1))
+    veil[3], veil[8] = 0.12, 0.05
+    solved = solve_photometry(scene[0], photographed(scene, exposure[:, None] + balance, np.zeros(3), veil))
+    assert np.abs(solved.veil).max() > 0
+    assert np.abs(solved.exposure - exposure).max() < 0.06
+    assert solved.veil[3, 0].mean() == pytest.approx(0.12, abs=0.03)
+
+
+def test_exif_decides_where_points_do_not(scene):
+    """Two pictures of opposite sides share no points: their exposures come from EXIF alone."""
+    exposure, _ = gains(4)
+    captures = photographed(scene, np.repeat(exposure[:, None], 3, axis=1), np.zeros(3))
+    stated = exposure + 0.3  # its common level is free
+    plain = solve_photometry(scene[0], captures)
+    told = solve_photometry(scene[0], captures, exif=stated)
+    assert np.abs(told.exposure - exposure).max() <= np.abs(plain.exposure - exposure).max() + 1e-3
+    wrong = solve_photometry(scene[0], captures, exif=np.where(np.arange(VIEWS) == 2, stated + 1, stated))
+    assert abs(wrong.exposure[2] - exposure[2]) < 0.1
+
+
+def test_cells_that_other_pictures_show_otherwise_are_ignored():
+    rng = np.random.default_rng(0)
+    share = rng.random((20000, 2))
+    picture = rng.integers(0, 2, 20000)
+    behind = (picture == 1) & (share < 0.25).all(axis=1)
+    residual = np.where(behind[:, None], 1.5, rng.normal(0, 0.05, (20000, 3)))
+    cells = ignored_cells(residual, 0.05, picture, share, ((300, 400), (300, 400)))
+    assert not cells[0].any()
+    whole = at_size(cells[1], (300, 400))
+    assert whole[:70, :95].mean() > 0.97 and not whole[100:, :].any() and not whole[:, 130:].any()
