@@ -164,6 +164,12 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="VGG-19 weights (.safetensors or .pth) for the style losses of finish and fit",
     )
+    verb.add_argument(
+        "--displace",
+        metavar="2%",
+        help="let vertices follow the outlines of edited or stylized views, by at most this share of the mesh's radius "
+        "(default 0: the mesh stays unchanged)",
+    )
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     verb.add_argument(
         "--preview",
@@ -199,6 +205,7 @@ def _add_stylize(verbs: Any) -> None:
             mistyle stylize bunny.obj starry_night.jpg -o out/ --from fit --set fit.iterations2=100
             mistyle stylize chair.usda wave.jpg -o out/ --formats glb,usd --target houdini
             mistyle stylize chair.glb wave.jpg -o out/ --target unreal,blender --name '{mesh}_{style}_v{v:03}'
+            mistyle stylize bunny.obj starry_night.jpg -o out/ --displace 10%     after drawing a tuft in out/stylized/
             mistyle stylize bunny.obj starry_night.jpg -o out/ --report none
             mistyle stylize --preset paper --print-config > job.toml
             """
@@ -292,6 +299,7 @@ OPTIONS = {
     **DELIVERY_OPTIONS,
     **REPORT_OPTIONS,
     "finish": "finish.method",
+    "displace": "displace.most",
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",

@@ -23,6 +23,7 @@ from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import mesh_stage, start_engines
 from mistyle.measure.baked_light import BakedLight
+from mistyle.stylization.displace.stage import Reshaped, check_displace, displace_stage
 from mistyle.stylization.optimise.light_left import light_left
 from mistyle.stylization.pipeline.budget import PLAIN, STYLED, TILED, counts
 from mistyle.stylization.pipeline.finishing import FinishRecord, check_finish, finish_stage
@@ -68,6 +69,7 @@ class StylizedJob:
     looks: tuple[StyleLook, ...]
     light: BakedLight | None
     finishing: FinishRecord | None = None
+    reshaped: Reshaped | None = None
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -121,14 +123,19 @@ def inputs_of(job: Job) -> list[Path]:
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> StylizedJob:
     s = run.job.settings
     asset = mesh_stage(run, files)
+    check_displace(run, asset)
     look_again(*size_of(asset))
     atlas = texels_stage(run, asset)
     views = views_stage(run, asset, atlas)
     looks = style_looks(style, run.job.style.name, s, run.progress)
     baked, stylized, finishing = painted_stages(run, asset, style, atlas, views)
-    painted = ["bake", "stylized"]
+    painted, reshaped = ["bake", "stylized"], None
+    if s.displace.most > 0:
+        reshaped = displace_stage(run, asset, atlas, baked, stylized)
+        asset, atlas, stylized = reshaped.asset, reshaped.atlas, reshaped.stylized
+        painted.append("displace")
     if "stylized" in run.edited:
-        baked, stylized = retouched_stage(run, asset, atlas, baked, stylized)
+        baked, stylized = retouched_stage(run, asset, atlas, baked, stylized, painted)
         painted = ["retouch"]
     if s.keeps_painting:
         run.skip(REFINING, painted)
@@ -147,8 +154,9 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     tell_edits(run)
     light = light_left(asset.mesh, atlas.texels, repaired.maps, s.seed)
     return StylizedJob(
-        run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light, finishing
-    )
+        run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light, finishing,
+        reshaped,
+    )  # fmt: skip
 
 
 def refined_stages(
@@ -181,7 +189,7 @@ def refined_stages(
 
 
 def retouched_stage(
-    run: Run, asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View]
+    run: Run, asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View], after: Sequence[str]
 ) -> tuple[Baked, Sequence[View]]:
     """The stage "retouch": user edits of the stylized views, baked into the texture and the other views."""
     from mistyle.stylization.pipeline.retouch import retouch
@@ -189,7 +197,7 @@ def retouched_stage(
     s, edited, folder = run.job.settings, run.edited["stylized"], run.visible.root / "stylized"
     retouched = run.record(
         "retouch",
-        ["bake", "stylized"],
+        after,
         [s.bake],
         lambda r: retouch(asset, atlas, baked, stylized, edited, folder, s, r),
     )
