@@ -170,6 +170,12 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
         help="let vertices follow the outlines of edited or stylized views, by at most this share of the mesh's radius "
         "(default 0: the mesh stays unchanged)",
     )
+    verb.add_argument(
+        "--height-map",
+        action="store_true",
+        default=None,
+        help="also write the painting's relief as a height map: 16-bit PNG, EXR, displacement in USD and MaterialX",
+    )
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     verb.add_argument(
         "--preview",
@@ -300,6 +306,7 @@ OPTIONS = {
     **REPORT_OPTIONS,
     "finish": "finish.method",
     "displace": "displace.most",
+    "height_map": "displace.height_map",
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",

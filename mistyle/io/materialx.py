@@ -16,6 +16,15 @@ from mistyle.io.store.atomic import atomic_write
 
 
 @dataclass(frozen=True)
+class HeightFile:
+    """A height map: the displacement along the normal is (value - middle) scale, in the mesh's units."""
+
+    file: str
+    middle: float
+    scale: float
+
+
+@dataclass(frozen=True)
 class TexturedMaterial:
     """A material and its images: file names as the document names them. The albedo is sRGB, or linear in `space` (None:
     linear Rec.709). `name` is an identifier (core/names.py); `title` is the user's name for it, or ""."""
@@ -28,6 +37,7 @@ class TexturedMaterial:
     srgb: bool = True
     space: ColourSpace | None = None
     title: str = ""
+    height: HeightFile | None = None
 
 
 def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
@@ -67,9 +77,28 @@ def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
         if look.title not in ("", look.name):
             material.set("doc", look.title)
         SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename=surface_name)
+        if look.height is not None:
+            _displaced(root, graph, material, graph_name, look.height)
     ElementTree.indent(root, "  ")
     text = ElementTree.tostring(root, encoding="unicode")
     atomic_write(path, f'<?xml version="1.0"?>\n{text}\n'.encode())
+
+
+def _displaced(root: Element, graph: Element, material: Element, graph_name: str, height: HeightFile) -> None:
+    """The displacement of a material: its height map about its middle, scaled to the mesh's units."""
+    _image(graph, "height", "float", height.file)
+    middle = SubElement(graph, "subtract", name="height_about_middle", type="float")
+    SubElement(middle, "input", name="in1", type="float", nodename="image_height")
+    SubElement(middle, "input", name="in2", type="float", value=f"{height.middle:.9g}")
+    SubElement(graph, "output", name="out_height", type="float", nodename="height_about_middle")
+    name = f"DS_{graph_name}"
+    shader = Element("displacement", name=name, type="displacementshader")
+    root.insert(list(root).index(material), shader)
+    SubElement(
+        shader, "input", name="displacement", type="float", nodegraph=graph_name, output="out_height"
+    )
+    SubElement(shader, "input", name="scale", type="float", value=f"{height.scale:.9g}")
+    SubElement(material, "input", name="displacementshader", type="displacementshader", nodename=name)
 
 
 def _image(graph: Element, name: str, kind: str, file: str) -> Element:

@@ -36,4 +36,8 @@ class DisplaceSettings(BaseModel):
         le=0.5,
         description="size of the smallest feature of an outline that the mesh follows, in bounding radii",
     )
+    height_map: bool = Field(
+        default=False,
+        description="also write the painting's relief as a height map (16-bit PNG, EXR); the mesh does not change by it",
+    )
     steps: int = Field(default=30, ge=1, le=500, description="most Gauss-Newton steps")

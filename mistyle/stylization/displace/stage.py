@@ -6,6 +6,7 @@ from typing import Any
 
 from mistyle.core.asset import Asset
 from mistyle.core.errors import UsageError
+from mistyle.core.maps import Heights
 from mistyle.core.view import View
 from mistyle.io.gltf.displaced import refuse_shared
 from mistyle.io.sandbox.bounds import USD
@@ -46,7 +47,7 @@ def displace_stage(run: Any, asset: Asset, atlas: Atlas, baked: Baked, stylized:
     if s.stylizer != "embedded" and s.sweep.segmenter is not None and not edited:
         masks = [one.seen for one in load_record(run.hidden.root / "surface" / "record")]
     shape = run.record(
-        "displace", ["stylized"], [s.displace], lambda r: follow_outlines(asset.mesh, stylized, masks, s.displace, r)
+        "displace", ["stylized"], [s.displace.model_copy(update={"height_map": False})], lambda r: follow_outlines(asset.mesh, stylized, masks, s.displace, r)
     )
     run.progress.note(*sentences(asset, shape))
     if not shape.changed:
@@ -55,6 +56,23 @@ def displace_stage(run: Any, asset: Asset, atlas: Atlas, baked: Baked, stylized:
     names = [name.rpartition(".")[0] for name in edited]
     views = moved_views(moved, baked.maps, stylized, names)
     return Reshaped(moved, moved_atlas(moved, atlas), views, asset, shape)
+
+
+def height_stage(run: Any, asset: Asset, atlas: Atlas) -> Heights | None:
+    """The stage "height": the painting's height on the mesh as it was painted; None without --height-map."""
+    from mistyle.stylization.displace.height import height_maps
+    from mistyle.stylization.pipeline.painting import relief_slope
+
+    s = run.job.settings
+    if not s.displace.height_map:
+        return None
+    slope = relief_slope(s)
+
+    def make(report: Any) -> Heights:
+        layers = load_record(run.hidden.root / "surface" / "record")
+        return height_maps(asset, layers, atlas, s, slope, report)
+
+    return run.record("height", ["surface", "texels"], [slope], make)
 
 
 def sentences(asset: Asset, shape: Shape) -> list[str]:

@@ -26,8 +26,8 @@ FIRST = {"first asset": "write the first asset"}
 RETOUCH = {"retouch": "bake the edited views"}
 # Only with --finish.
 FINISH = {"finish": "finish the painting"}
-# Only with --displace.
-DISPLACE = {"displace": "displace the mesh to the outlines"}
+# Only with --displace or --height-map.
+DISPLACE = {"displace": "displace the mesh to the outlines", "height": "look up the painting's height"}
 EVERY_STAGE = STAGES | RETOUCH | FINISH | DISPLACE
 # Those of `mistyle stylize --preview`.
 PREVIEW_STAGES = {name: STAGES[name] for name in ("mesh", "texels", "surface")} | {"preview": "draw the preview"}

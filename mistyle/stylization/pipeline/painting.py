@@ -148,7 +148,7 @@ def raised(
     from mistyle.stylization.surface.layers import PaintRelief, TexelBand, lay_relief, painted_mask, protected
     from mistyle.stylization.surface.surface_painter import surface_relief
 
-    height = HEIGHT if settings.paint.height is None else settings.paint.height
+    height = relief_slope(settings)
     gloss = GLOSS if settings.paint.gloss is None else settings.paint.gloss
     if height == gloss == 0:
         return list(maps)
@@ -168,6 +168,11 @@ def raised(
             bent = protected(bent, flat, painted_mask(settings.paint.protect, texels))
         result.append(bent)
     return result
+
+
+def relief_slope(settings: Settings) -> float:
+    """Slope (root mean square) of the painting's relief."""
+    return HEIGHT if settings.paint.height is None else settings.paint.height
 
 
 def pieces(at: np.ndarray) -> Iterator[slice]:

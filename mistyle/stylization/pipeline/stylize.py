@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Heights, Maps, Texels
 from mistyle.core.view import View
 from mistyle.deliver import asset_files
 from mistyle.io.images.textures import part_stems
@@ -23,7 +23,8 @@ from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import mesh_stage, start_engines
 from mistyle.measure.baked_light import BakedLight
-from mistyle.stylization.displace.stage import Reshaped, check_displace, displace_stage
+from mistyle.stylization.displace.height import check_height
+from mistyle.stylization.displace.stage import Reshaped, check_displace, displace_stage, height_stage
 from mistyle.stylization.optimise.light_left import light_left
 from mistyle.stylization.pipeline.budget import PLAIN, STYLED, TILED, counts
 from mistyle.stylization.pipeline.finishing import FinishRecord, check_finish, finish_stage
@@ -42,6 +43,7 @@ from mistyle.stylization.pipeline.painting import (
     bake,
     check_paint,
     paint_files,
+    relief_slope,
     stylized_stage,
     surface_stage,
     unlit_views,
@@ -90,6 +92,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     check_paint(job.settings.paint)
     check_generative(job.settings, progress.say)
     check_finish(job.settings)
+    check_height(job.settings, relief_slope(job.settings))
     if job.settings.stylizer != "embedded":
         from mistyle.stylization.pipeline.sweep import refuse_unsupported
 
@@ -130,6 +133,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     looks = style_looks(style, run.job.style.name, s, run.progress)
     baked, stylized, finishing = painted_stages(run, asset, style, atlas, views)
     painted, reshaped = ["bake", "stylized"], None
+    heights = height_stage(run, asset, atlas)
     if s.displace.most > 0:
         reshaped = displace_stage(run, asset, atlas, baked, stylized)
         asset, atlas, stylized = reshaped.asset, reshaped.atlas, reshaped.stylized
@@ -146,9 +150,10 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
 
     def write(folder: Path, edited: Edited, report: Report) -> None:
         sets = zip(atlas.texels, repaired.maps, strict=True)
-        write_asset(folder, run.job, asset, sets, report, edited)
+        write_asset(folder, run.job, asset, sets, report, edited, heights)
 
-    folder, edited = asset_stage(run, ["repair"], write, {"painted": run.keys["bake"]})
+    after = ["repair"] if heights is None else ["repair", "height"]
+    folder, edited = asset_stage(run, after, write, {"painted": run.keys["bake"]})
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
@@ -371,7 +376,8 @@ def write_asset(
     sets: Iterable[tuple[Texels, Maps]],
     report: Report,
     edited: Edited = UNEDITED,
+    heights: Heights | None = None,
 ) -> None:
     """Write the delivered files, set after set; `edited` holds textures that a user painted over."""
     provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed}
-    asset_files.write(folder, job, asset, sets, provenance, report, edited)
+    asset_files.write(folder, job, asset, sets, provenance, report, edited, heights=heights)
