@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 CHUNK = 1_000_000  # candidate pairs at a time
-INSIDE = 1e-9  # relative margin: triangles that only touch do not intersect
+INSIDE = 1e-9  # relative margin of the signed volumes: an edge that only touches a plane does not cross it
 
 
 def self_intersections(
@@ -19,7 +19,8 @@ def self_intersections(
     `points` are welded: equal places have equal indices. Pairs that share an edge are left out: they meet there, and
     fold only where a normal turns over. Pairs that share one point intersect where the edge opposite it passes through
     the other face. Coplanar overlaps are not found. An edge passes through a triangle if its ends lie strictly on
-    different sides of the plane and the triangle's edges see it with one orientation (signed volumes).
+    different sides of the plane and no edge of the triangle sees it with another orientation (signed volumes): an edge
+    through an edge counts.
     """
     found, near = [np.zeros((0, 2), np.int64)], np.arange(len(faces))
     if chosen is not None:
@@ -94,7 +95,7 @@ def _pierces(
         above, below = _volume(p, q, r, s), _volume(p, q, r, t)
         crosses = (np.minimum(above, below) < -limit) & (np.maximum(above, below) > limit)
         sides = np.stack([_volume(s, t, p, q), _volume(s, t, q, r), _volume(s, t, r, p)], axis=1)
-        inside = (sides > limit[:, None]).all(axis=1) | (sides < -limit[:, None]).all(axis=1)
+        inside = (sides >= -limit[:, None]).all(axis=1) | (sides <= limit[:, None]).all(axis=1)
         result |= apart & crosses & inside
     return result
 
