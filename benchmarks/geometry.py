@@ -4,9 +4,14 @@ A sphere (5,120 faces) follows 16 outlines of an ellipsoid with half axes 1, 0.8
 distance to the ellipsoid, in bounding radii. Then a shape is drawn onto the outline of one view of three meshes: a
 horn on spot, a tip on an ear of the bunny, a fin on the handle of the teapot. Figures are their overlap with the drawn outline before and
 after (mean of the three), triangles that turned over, and pairs of triangles that intersect now and did not before.
+
+With --blender PYTHON (or $MISTYLE_BLENDER_PYTHON) the displaced spot is written as GLB and read by Blender: the largest
+difference of its corners from the displaced ones (bounding radii) and of its UVs from those of the file.
 """
 
 import os
+import subprocess
+import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,6 +56,7 @@ DRAWINGS = (
 
 def main() -> None:
     options = parser("python -m benchmarks.geometry")
+    options.add_argument("--blender", default=os.environ.get("MISTYLE_BLENDER_PYTHON"), help="Python with bpy")
     options.add_argument("--sheets", type=Path, help="folder for the pictures before and after")
     chosen = options.parse_args()
     began, size = time.perf_counter(), 256 if chosen.quick else 512
@@ -60,6 +66,8 @@ def main() -> None:
         figures[name] = float(np.mean([row[name] for row in rows]))
     for name in ("flipped", "new_self_intersections"):
         figures[name] = figures.get(name, 0) + sum(row[name] for row in rows)
+    if chosen.blender:
+        figures |= in_blender(DRAWINGS[0], size, chosen.blender)
     for drawing, row in zip(DRAWINGS, rows, strict=False):
         figures |= {f"{Path(drawing.mesh).stem}.{name}": value for name, value in row.items()}
     finish(figures | {"seconds": time.perf_counter() - began}, chosen.json)
@@ -116,6 +124,33 @@ def drawn_on(drawing: Drawing, size: int, sheets: Path | None) -> dict[str, floa
     before, after = shape.overlap
     figures = {"silhouette_iou_before": before, "silhouette_iou_after": after, "seconds": seconds}
     return figures | wholeness(mesh, moved)
+
+
+def in_blender(drawing: Drawing, size: int, python: str) -> dict[str, float]:
+    """Blender's corners and UVs of the displaced mesh against ours, triangle by triangle."""
+    from mistyle.core.maps import flat_maps
+    from mistyle.io.gltf.write import write_glb
+    from mistyle.io.read_mesh import read_mesh
+    from mistyle.solver.shape.moved import displaced_asset
+
+    asset = read_mesh(Path(os.environ["MISTYLE_DATA"]) / drawing.mesh)
+    camera = orbit(drawing.azimuth, 0.0, distance=4, fov=30, size=(size, size))
+    (own,) = coverages(asset.mesh, [empty_view(camera)])
+    view = replace(empty_view(camera), coverage=with_triangle(own, camera, drawing))
+    result = follow_outlines(asset.mesh, [view], None, DisplaceSettings(most=BOUND), lambda done: None).result
+    moved = displaced_asset(asset, asset.mesh.positions if result is None else result.positions)
+    with tempfile.TemporaryDirectory() as folder:
+        glb, out = Path(folder, "spot.glb"), Path(folder, "spot.npz")
+        write_glb(glb, moved, [flat_maps(4)], [np.ones((4, 4), np.float32)], name="spot")
+        worker = Path(__file__).with_name("geometry_worker.py")
+        subprocess.run([python, str(worker), str(glb), str(out)], check=True, capture_output=True)
+        with np.load(out) as found:
+            corners, uvs = found["corners"], found["uvs"]
+    unit = 1 / np.cbrt(np.linalg.det(asset.source.work_from_user[:3, :3]))
+    shape = np.abs(corners - moved.source.user_positions[moved.mesh.faces]).max() / unit
+    back = np.linalg.norm(moved.mesh.positions - asset.mesh.positions, axis=1).max()
+    same = np.abs(uvs - asset.mesh.corner_uvs).max()
+    return {"blender_displacement": float(back), "blender_corners": float(shape), "blender_uvs": float(same)}
 
 
 def wholeness(before: Mesh, after: Mesh) -> dict[str, float]:
