@@ -183,7 +183,10 @@ def _write_height(folder: Path, stem: str, height: np.ndarray, scale: float) -> 
     write_png(png, np.clip(height / np.float32(scale) + np.float32(0.5), 0, 1), bits=16)
     write_exr(exr, {"Y": height}, attributes={"mistyle:map": "height", "colorInteropID": "data"})
     about = {"map": "height", "what": HEIGHT, "size": [height.shape[1], height.shape[0]]}
-    return [(png, about | {"bits": 16, "middle": 0.5, "scale": scale}), (exr, about | {"bits": 32, "middle": 0.0, "scale": 1.0})]
+    return [
+        (png, about | {"bits": 16, "middle": 0.5, "scale": scale}),
+        (exr, about | {"bits": 32, "middle": 0.0, "scale": 1.0}),
+    ]
 
 
 def _entry(folder: Path, path: Path, **about: Any) -> dict[str, Any]:

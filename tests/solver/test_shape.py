@@ -28,7 +28,9 @@ def mesh_of(points: np.ndarray, faces: np.ndarray) -> Mesh:
     normals = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-9)
     corners = normals[faces].astype(np.float32)
     none = np.zeros((len(faces), 3, 2), np.float32)
-    return Mesh(points.astype(np.float32), faces.astype(np.int32), corners, none, np.zeros(len(faces), np.int32), ("a",))
+    return Mesh(
+        points.astype(np.float32), faces.astype(np.int32), corners, none, np.zeros(len(faces), np.int32), ("a",)
+    )
 
 
 def sphere(rounds: int, radius: float = 0.9) -> Mesh:

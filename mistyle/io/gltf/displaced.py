@@ -26,9 +26,8 @@ def refuse_shared(asset: Asset) -> None:
     shared = sorted({mesh for (mesh, _), count in uses.items() if count > 1})
     if shared:
         raise UsageError(
-            f"--displace: {asset.source.path.name} shows mesh {shared[0]} in several places; expected one place for each "
-            "mesh, since a displacement belongs to one. Make the meshes single-user and export the file again, or leave "
-            "out --displace"
+            f"--displace: {asset.source.path.name} shows mesh {shared[0]} in several places; expected one, since each "
+            "place would need its own shape. Make the meshes single-user and export again, or leave out --displace"
         )
 
 

@@ -54,9 +54,7 @@ def new_intersections(
     return pairs[~np.isin(_keys(surface, pairs), start.pairs)]
 
 
-def checked_step(
-    start: Start, surface: Surface, x: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
-) -> Step:
+def checked_step(start: Start, surface: Surface, x: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Step:
     """From the valid displacement `x` towards `target`: steps are halved around triangles that would be bad, and the
     last resort is to stay."""
     share = np.ones(len(x))

@@ -34,8 +34,7 @@ def turned_normals(mesh: Mesh, positions: Float[np.ndarray, "v 3"]) -> Float[np.
     normals = mesh.corner_normals.reshape(-1, 3)
     kinds, group = distinct(corner_rows(point, normals.astype(np.float32)))
     before, after = (
-        _sums(group, np.repeat(area_vectors(p, mesh.faces), 3, axis=0), len(kinds))
-        for p in (mesh.positions, positions)
+        _sums(group, np.repeat(area_vectors(p, mesh.faces), 3, axis=0), len(kinds)) for p in (mesh.positions, positions)
     )
     changed = (before != after).any(axis=1)
     result = normals.copy()

@@ -38,6 +38,6 @@ class DisplaceSettings(BaseModel):
     )
     height_map: bool = Field(
         default=False,
-        description="also write the painting's relief as a height map (16-bit PNG, EXR); the mesh does not change by it",
+        description="also write the painting's relief as a height map (16-bit PNG, EXR); it does not move vertices",
     )
     steps: int = Field(default=30, ge=1, le=500, description="most Gauss-Newton steps")

@@ -35,8 +35,8 @@ def check_displace(run: Any, asset: Asset) -> None:
     refuse_shared(asset)
     if s.deliver.wanted and "usd" in s.deliver.formats and asset.source.path.suffix.lower() in USD:
         raise UsageError(
-            f"--displace: the USD delivery of {asset.source.path.name} is a look layer over the file, whose points stay; "
-            "expected another format. Leave usd out of --formats, or leave out --displace"
+            f"--displace: the USD delivery of {asset.source.path.name} is a look layer over the file, whose points "
+            "stay; expected another format. Leave usd out of --formats, or leave out --displace"
         )
 
 
@@ -47,7 +47,10 @@ def displace_stage(run: Any, asset: Asset, atlas: Atlas, baked: Baked, stylized:
     if s.stylizer != "embedded" and s.sweep.segmenter is not None and not edited:
         masks = [one.seen for one in load_record(run.hidden.root / "surface" / "record")]
     shape = run.record(
-        "displace", ["stylized"], [s.displace.model_copy(update={"height_map": False})], lambda r: follow_outlines(asset.mesh, stylized, masks, s.displace, r)
+        "displace",
+        ["stylized"],
+        [s.displace.model_copy(update={"height_map": False})],
+        lambda r: follow_outlines(asset.mesh, stylized, masks, s.displace, r),
     )
     run.progress.note(*sentences(asset, shape))
     if not shape.changed:
@@ -83,8 +86,8 @@ def sentences(asset: Asset, shape: Shape) -> list[str]:
     if shape.result is None:
         return [
             *notes,
-            "--displace: every view has the mesh's own outline, so no vertex moved. Draw onto a PNG in stylized/ outside "
-            "the object, keep its transparency, and rerun.",
+            "--displace: every view has the mesh's own outline, so no vertex moved. Draw outside the object on a PNG "
+            "in stylized/, keep its transparency, and rerun.",
         ]
     if not shape.changed:
         return [
@@ -96,7 +99,7 @@ def sentences(asset: Asset, shape: Shape) -> list[str]:
     before, after = shape.overlap
     notes.append(
         f"--displace: vertices moved by up to {100 * most:.1f} % of the bounding radius to the outlines of "
-        f"{len(shape.views)} views; their overlap with the mesh went from {before:.4f} to {after:.4f}. UVs, topology and "
-        "skinning are unchanged."
+        f"{len(shape.views)} view(s); their overlap with the mesh went from {before:.4f} to {after:.4f}. UVs, topology "
+        "and skinning are unchanged."
     )
     return notes

@@ -55,7 +55,10 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "style_before": ("distance of VGG-19's statistics to the painting's, on held-out crops, before", "lower"),
     "style_after": ("the same after the finish", "lower"),
     "moved": ("root mean square change of the albedo by the finish, sRGB units", ""),
-    "overlap_before": ("intersection over union of changed outlines with the mesh's, before the displacement", "higher"),
+    "overlap_before": (
+        "intersection over union of changed outlines with the mesh's, before displacing it",
+        "higher",
+    ),
     "overlap_after": ("the same after the displacement", "higher"),
     "most": ("largest displacement of a vertex, in bounding radii", ""),
     "detail": ("correlation of the render's fine lightness with the stylized views' after this phase", "higher"),
