@@ -2,8 +2,9 @@
 
 A sphere (5,120 faces) follows 16 outlines of an ellipsoid with half axes 1, 0.82 and 0.9: the two-sided Hausdorff
 distance to the ellipsoid, in bounding radii. Then a shape is drawn onto the outline of one view of three meshes: a
-horn on spot, a tip on an ear of the bunny, a fin on the handle of the teapot. Figures are their overlap with the drawn outline before and
-after (mean of the three), triangles that turned over, and pairs of triangles that intersect now and did not before.
+horn on spot, a tip on an ear of the bunny, a fin on the handle of the teapot. Figures are the mean overlap of the three
+with the drawn outline before and after, triangles that turned over, and pairs of triangles that intersect now and did
+not before.
 
 With --blender PYTHON (or $MISTYLE_BLENDER_PYTHON) the displaced spot is written as GLB and read by Blender: the largest
 difference of its corners from the displaced ones (bounding radii) and of its UVs from those of the file.
@@ -26,7 +27,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.solver.shape.checks import flipped, new_intersections, start_of
-from mistyle.solver.shape.displace import Outline, displace
+from mistyle.solver.shape.displace import TargetOutline, displace
 from mistyle.solver.shape.settings import DisplaceSettings
 from mistyle.solver.shape.surface import surface_of
 from mistyle.stylization.displace.outlines import coverages, follow_outlines
@@ -84,7 +85,7 @@ def ellipsoid(size: int, rounds: int) -> dict[str, float]:
     cameras = rig(RigSettings(resolution=size))
     views = [empty_view(camera) for camera in cameras]
     pairs = zip(cameras, coverages(wanted, views), coverages(begun, views), strict=True)
-    outlines = [Outline(camera, target, np.abs(target - own) > 0.3) for camera, target, own in pairs]
+    outlines = [TargetOutline(camera, target, np.abs(target - own) > 0.3) for camera, target, own in pairs]
     result = displace(begun, outlines, DisplaceSettings(most=BOUND))
     moved = replace(begun, positions=result.positions)
     both = [farthest(moved, wanted), farthest(wanted, moved)]
@@ -94,12 +95,12 @@ def ellipsoid(size: int, rounds: int) -> dict[str, float]:
 def farthest(one: Mesh, other: Mesh, count: int = 60_000, near: int = 24) -> float:
     """The largest distance of vertices and random points of one mesh from the triangles of the other."""
     import trimesh
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     own = trimesh.Trimesh(one.positions, one.faces, process=False)
     points = np.concatenate([one.positions, np.asarray(trimesh.sample.sample_surface(own, count, seed=0)[0])])
     corners = other.positions[other.faces].astype(float)
-    index = cKDTree(corners.mean(axis=1)).query(points, k=near)[1]
+    index = KDTree(corners.mean(axis=1)).query(points, k=near)[1]
     best = np.full(len(points), np.inf)
     for k in range(near):
         place = trimesh.triangles.closest_point(corners[index[:, k]], points.astype(float))

@@ -25,12 +25,14 @@ from mistyle.cli.options import (
     NAME_HELP,
     PAINT_OPTIONS,
     REPORT_OPTIONS,
+    SHAPE_OPTIONS,
     add_delivery_options,
     add_job_options,
     add_memory_option,
     add_mesh_options,
     add_paint_options,
     add_report_option,
+    add_shape_options,
     asset_name,
     examples,
     given_settings,
@@ -164,18 +166,7 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="VGG-19 weights (.safetensors or .pth) for the style losses of finish and fit",
     )
-    verb.add_argument(
-        "--displace",
-        metavar="2%",
-        help="let vertices follow the outlines of edited or stylized views, by at most this share of the mesh's radius "
-        "(default 0: the mesh stays unchanged)",
-    )
-    verb.add_argument(
-        "--height-map",
-        action="store_true",
-        default=None,
-        help="also write the painting's relief as a height map: 16-bit PNG, EXR, displacement in USD and MaterialX",
-    )
+    add_shape_options(verb)
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     verb.add_argument(
         "--preview",
@@ -305,8 +296,7 @@ OPTIONS = {
     **DELIVERY_OPTIONS,
     **REPORT_OPTIONS,
     "finish": "finish.method",
-    "displace": "displace.most",
-    "height_map": "displace.height_map",
+    **SHAPE_OPTIONS,
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",

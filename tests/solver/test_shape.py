@@ -14,7 +14,7 @@ from mistyle.geometry.intersections import self_intersections
 from mistyle.render.mitsuba.draw import misses, tracer
 from mistyle.render.mitsuba.unlit import unlit
 from mistyle.solver.shape.checks import checked_step, flipped, new_intersections, start_of
-from mistyle.solver.shape.displace import Outline, displace
+from mistyle.solver.shape.displace import TargetOutline, displace
 from mistyle.solver.shape.moved import turned_normals
 from mistyle.solver.shape.outlines import contour_of, silhouette_of
 from mistyle.solver.shape.projective import silhouette_loss
@@ -90,7 +90,7 @@ def test_a_sphere_becomes_the_ellipsoid_of_its_outlines():
     outlines = []
     for camera in cameras:
         target, own = coverage(wanted, camera), coverage(begun, camera)
-        outlines.append(Outline(camera, target, np.abs(target - own) > 0.3))
+        outlines.append(TargetOutline(camera, target, np.abs(target - own) > 0.3))
     result = displace(begun, outlines, DisplaceSettings(most=0.2))
     # The distance of a point near the ellipsoid, to first order: |f| / |grad f| of its implicit function.
     scaled = result.positions / AXES
@@ -106,7 +106,7 @@ def test_the_bound_the_normal_and_the_far_side_hold():
     own = coverage(mesh, camera)
     target = own.copy()
     target[8:60, 118:138] = 1  # a post on the top
-    outline = Outline(camera, target, np.abs(target - own) > 0.5)
+    outline = TargetOutline(camera, target, np.abs(target - own) > 0.5)
     result = displace(mesh, [outline], DisplaceSettings(most=0.05, along="normal"))
     again = displace(mesh, [outline], DisplaceSettings(most=0.05, along="normal"))
     assert again.positions.tobytes() == result.positions.tobytes()
@@ -128,7 +128,7 @@ def test_boundaries_stay_and_seams_move_as_one():
     camera = orbit(0, 0, distance=4, fov=30, size=(128, 128))
     own = coverage(mesh, camera)
     target = np.maximum(own, np.roll(own, -6, axis=0))
-    result = displace(mesh, [Outline(camera, target, np.abs(target - own) > 0.5)], DisplaceSettings(most=0.2))
+    result = displace(mesh, [TargetOutline(camera, target, np.abs(target - own) > 0.5)], DisplaceSettings(most=0.2))
     surface = surface_of(mesh)
     assert surface.fixed.any() and not surface.fixed.all()
     places = np.stack([np.bincount(surface.of_vertex, result.positions[:, k]) for k in range(3)], axis=1)
@@ -208,10 +208,10 @@ def test_normals_turn_with_the_surface():
 def test_a_mesh_without_evidence_keeps_its_bits():
     mesh, camera = sphere(2), orbit(0, 0, distance=4, fov=30, size=(96, 96))
     own = coverage(mesh, camera)
-    result = displace(mesh, [Outline(camera, own, np.zeros(own.shape, bool))], DisplaceSettings(most=0.1))
+    result = displace(mesh, [TargetOutline(camera, own, np.zeros(own.shape, bool))], DisplaceSettings(most=0.1))
     assert result.positions.tobytes() == mesh.positions.tobytes()
     # Outlines that count everywhere but agree move nothing either.
-    result = displace(mesh, [Outline(camera, own, np.ones(own.shape, bool))], DisplaceSettings(most=0.1))
+    result = displace(mesh, [TargetOutline(camera, own, np.ones(own.shape, bool))], DisplaceSettings(most=0.1))
     assert np.abs(result.positions - mesh.positions).max() < 1e-3
 
 

@@ -89,7 +89,8 @@ def _normals(
     corners = np.flatnonzero((vertex >= rows.start) & (vertex < rows.stop))
     near = np.zeros(len(asset.mesh.positions), bool)
     assert asset.source.displacement is not None
-    faces = asset.source.displacement.any(axis=1)[asset.mesh.faces].any(axis=1)
+    moved: np.ndarray = asset.source.displacement.any(axis=1)
+    faces = moved[asset.mesh.faces].any(axis=1)
     near[asset.mesh.faces[faces].reshape(-1)] = True
     corners = corners[near[vertex[corners]]]
     at = vertex[corners] - rows.start

@@ -24,7 +24,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Step:
+class CheckedStep:
     """A displacement that passed the checks; `held` counts the points whose step was shortened."""
 
     displacement: Float[np.ndarray, "n 3"]
@@ -54,7 +54,9 @@ def new_intersections(
     return pairs[~np.isin(_keys(surface, pairs), start.pairs)]
 
 
-def checked_step(start: Start, surface: Surface, x: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Step:
+def checked_step(
+    start: Start, surface: Surface, x: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
+) -> CheckedStep:
     """From the valid displacement `x` towards `target`: steps are halved around triangles that would be bad, and the
     last resort is to stay."""
     share = np.ones(len(x))
@@ -65,13 +67,13 @@ def checked_step(start: Start, surface: Surface, x: Float[np.ndarray, "n 3"], ta
         if not bad.any():
             bad[new_intersections(start, surface, surface.points + now, moved).reshape(-1)] = True
         if not bad.any():
-            return Step(now, int((share < 1).sum()))
+            return CheckedStep(now, int((share < 1).sum()))
         points = np.unique(surface.faces[bad])
         if attempt >= SPREAD:
             beside = np.isin(surface.edges, points).any(axis=1)
             points = np.union1d(points, surface.edges[beside].reshape(-1))
         share[points] = share[points] / 2 if attempt < TRIES else 0
-    return Step(x, int((target != x).any(axis=1).sum()))
+    return CheckedStep(x, int((target != x).any(axis=1).sum()))
 
 
 def _keys(surface: Surface, pairs: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, " k"]:

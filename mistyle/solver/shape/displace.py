@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float
 from scipy.sparse.linalg import LinearOperator, cg, splu
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.image import dilate, erode
@@ -52,7 +52,7 @@ ACCURACY, ROUNDS = 1e-4, 200  # of a linear solve
 
 
 @dataclass(frozen=True)
-class Outline:
+class TargetOutline:
     """A view whose outline the mesh should have: its camera, its coverage (0..1), and the mask of pixels at which it
     counts. Elsewhere the mesh keeps its own outline."""
 
@@ -88,7 +88,7 @@ class _Target:
 
     camera: Camera
     contour: Contour
-    tree: cKDTree
+    tree: KDTree
     counts: Bool[np.ndarray, "h w"]
     band: Float[np.ndarray, "b 2"]
     inside: Bool[np.ndarray, " b"]
@@ -119,7 +119,7 @@ class _Rows:
 
 def displace(
     mesh: Mesh,
-    outlines: Sequence[Outline],
+    outlines: Sequence[TargetOutline],
     settings: DisplaceSettings,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Displaced:
@@ -170,7 +170,7 @@ def displace(
     )
 
 
-def _loss(surface: Surface, x: Float[np.ndarray, "n 3"], outlines: Sequence[Outline]) -> float:
+def _loss(surface: Surface, x: Float[np.ndarray, "n 3"], outlines: Sequence[TargetOutline]) -> float:
     """The judge: mean squared difference of Mitsuba's silhouettes from the outlines."""
     cameras, coverages = [o.camera for o in outlines], [o.coverage for o in outlines]
     return silhouette_loss(surface.points + x, surface.faces, cameras, coverages)[0]
@@ -178,12 +178,13 @@ def _loss(surface: Surface, x: Float[np.ndarray, "n 3"], outlines: Sequence[Outl
 
 def moved_positions(mesh: Mesh, surface: Surface, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 3"]:
     """Positions of the mesh with displaced points; those of other points keep their bits."""
-    moved = x.any(axis=1)[surface.of_vertex]
+    points: np.ndarray = x.any(axis=1)
+    moved = points[surface.of_vertex]
     new = (surface.points + x)[surface.of_vertex].astype(mesh.positions.dtype)
     return np.where(moved[:, None], new, mesh.positions)
 
 
-def _target(outline: Outline) -> _Target | None:
+def _target(outline: TargetOutline) -> _Target | None:
     """The contour of an outline; None where it has none."""
     contour = contour_of(outline.coverage)
     if not len(contour.points) or not outline.counts.any():
@@ -191,7 +192,7 @@ def _target(outline: Outline) -> _Target | None:
     inside = outline.coverage > 0.5
     band = dilate(outline.counts, BAND) | (dilate(inside, NEAR) & ~erode(inside, NEAR))
     px = pixel_centres(outline.camera.size)[band]
-    tree, counts = cKDTree(contour.points), dilate(outline.counts, NEAR)
+    tree, counts = KDTree(contour.points), dilate(outline.counts, NEAR)
     return _Target(outline.camera, contour, tree, counts, px, inside[band])
 
 
@@ -200,7 +201,7 @@ def _reach(surface: Surface, rows: _Rows) -> Float[np.ndarray, " n"]:
     pulled = np.unique(rows.jacobian[rows.residual != 0].indices // 3)
     if not len(pulled):
         return np.ones(len(surface.points))
-    distance = cKDTree(surface.points[pulled]).query(surface.points)[0]
+    distance = KDTree(surface.points[pulled]).query(surface.points)[0]
     return np.clip((distance - NEARBY) / (ELSEWHERE - NEARBY), 0, 1)
 
 
@@ -233,7 +234,7 @@ def _solved(rows: _Rows, stiff: Any, basis: Any, x: Float[np.ndarray, "n 3"]) ->
     options = {"SymmetricMode": True}
     factor = splu((energy + sp.diags_array(data)).tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     shape = (len(rhs) // per, per)
-    around = LinearOperator(lhs.shape, lambda v: factor.solve(v.reshape(shape)).reshape(-1), dtype=float)
+    around: Any = LinearOperator(lhs.shape, matvec=lambda v: factor.solve(v.reshape(shape)).reshape(-1))
     return cg(lhs, rhs, basis.T @ x.reshape(-1), rtol=ACCURACY, maxiter=ROUNDS, M=around)[0]
 
 
@@ -291,7 +292,7 @@ def _pulled(seen: Silhouette, target: _Target) -> tuple[np.ndarray, ...]:
     column, row = np.floor(target.contour.points).astype(np.int64).T
     height, width = target.counts.shape
     chosen = np.flatnonzero(target.counts[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])
-    distance, nearest = cKDTree(seen.place).query(target.contour.points[chosen])
+    distance, nearest = KDTree(seen.place).query(target.contour.points[chosen])
     facing = (target.contour.normals[chosen] * seen.normal[nearest]).sum(axis=1) > -ALIKE
     far = (distance > 1) & facing
     chosen, nearest, distance = chosen[far], nearest[far], distance[far]

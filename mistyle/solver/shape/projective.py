@@ -59,7 +59,7 @@ def silhouette_loss(
             dr.enable_grad(params[key])
             params.update()
         sensor = mi.load_dict(_sensor(camera, spp, seed + k))
-        picture = mi.render(scene, params, sensor=sensor, spp=spp, seed=seed + k)
+        picture = mi.render(scene, params, sensor=sensor, spp=spp, seed=mi.UInt32(seed + k))
         loss = dr.mean(dr.square(picture[:, :, 0] - target), axis=None)
         total += float(np.array(dr.detach(loss)).ravel()[0])
         if gradient:

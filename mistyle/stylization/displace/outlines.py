@@ -16,7 +16,7 @@ from mistyle.core.image import overlap
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.solver.shape.displace import Displaced, Outline, displace
+from mistyle.solver.shape.displace import Displaced, TargetOutline, displace
 from mistyle.solver.shape.settings import DisplaceSettings
 from mistyle.stylization.records import Atlas
 
@@ -73,7 +73,7 @@ def follow_outlines(
 
 def outline_of(
     view: View, coverage: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w"]
-) -> tuple[Outline | None, int]:
+) -> tuple[TargetOutline | None, int]:
     """The outline that a view asks for, and the count of painted pieces apart from the object; None where the coverage
     agrees with the mesh's own."""
     count, label = cv2.connectedComponents((coverage > 0.5).astype(np.uint8), connectivity=8)
@@ -82,9 +82,9 @@ def outline_of(
     coverage = np.where(apart, 0, coverage).astype(np.float32)
     changed = (np.abs(coverage - drawn) > CHANGED).astype(np.uint8)
     _, group, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
-    counts = (changed > 0) & (stats[group, cv2.CC_STAT_AREA] >= FEWEST)
+    counts = (changed > 0) & (stats[:, cv2.CC_STAT_AREA].take(np.asarray(group, np.int64)) >= FEWEST)
     pieces = count - 1 - len(touching)
-    return (Outline(view.camera, coverage, counts) if counts.any() else None), pieces
+    return (TargetOutline(view.camera, coverage, counts) if counts.any() else None), pieces
 
 
 def coverages(mesh: Mesh, views: Sequence[View]) -> list[Float[np.ndarray, "h w"]]:
