@@ -6,6 +6,7 @@ indices and texture coordinates stay. Nodes must not share a moved mesh, since e
 """
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -89,7 +90,7 @@ def _normals(
     corners = np.flatnonzero((vertex >= rows.start) & (vertex < rows.stop))
     near = np.zeros(len(asset.mesh.positions), bool)
     assert asset.source.displacement is not None
-    moved: np.ndarray = asset.source.displacement.any(axis=1)
+    moved: Any = asset.source.displacement.any(axis=1)
     faces = moved[asset.mesh.faces].any(axis=1)
     near[asset.mesh.faces[faces].reshape(-1)] = True
     corners = corners[near[vertex[corners]]]
