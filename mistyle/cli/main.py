@@ -25,12 +25,14 @@ from mistyle.cli.options import (
     NAME_HELP,
     PAINT_OPTIONS,
     REPORT_OPTIONS,
+    SHAPE_OPTIONS,
     add_delivery_options,
     add_job_options,
     add_memory_option,
     add_mesh_options,
     add_paint_options,
     add_report_option,
+    add_shape_options,
     asset_name,
     examples,
     given_settings,
@@ -164,6 +166,7 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="VGG-19 weights (.safetensors or .pth) for the style losses of finish and fit",
     )
+    add_shape_options(verb)
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     verb.add_argument(
         "--preview",
@@ -199,6 +202,7 @@ def _add_stylize(verbs: Any) -> None:
             mistyle stylize bunny.obj starry_night.jpg -o out/ --from fit --set fit.iterations2=100
             mistyle stylize chair.usda wave.jpg -o out/ --formats glb,usd --target houdini
             mistyle stylize chair.glb wave.jpg -o out/ --target unreal,blender --name '{mesh}_{style}_v{v:03}'
+            mistyle stylize bunny.obj starry_night.jpg -o out/ --displace 10%     after drawing a tuft in out/stylized/
             mistyle stylize bunny.obj starry_night.jpg -o out/ --report none
             mistyle stylize --preset paper --print-config > job.toml
             """
@@ -292,6 +296,7 @@ OPTIONS = {
     **DELIVERY_OPTIONS,
     **REPORT_OPTIONS,
     "finish": "finish.method",
+    **SHAPE_OPTIONS,
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",

@@ -151,6 +151,26 @@ def add_paint_options(verb: argparse.ArgumentParser) -> None:
     )
 
 
+# Option -> dotted setting, for `add_shape_options`.
+SHAPE_OPTIONS = {"displace": "displace.most", "height_map": "displace.height_map"}
+
+
+def add_shape_options(verb: argparse.ArgumentParser) -> None:
+    """Options of the shape: displaced vertices and the height map."""
+    verb.add_argument(
+        "--displace",
+        metavar="2%",
+        help="let vertices follow the outlines of edited or stylized views, by at most this share of the mesh's radius "
+        "(default 0: the mesh stays unchanged)",
+    )
+    verb.add_argument(
+        "--height-map",
+        action="store_true",
+        default=None,
+        help="also write the painting's relief as a height map: 16-bit PNG, EXR, displacement in USD and MaterialX",
+    )
+
+
 # Option -> dotted setting, for `add_delivery_options`.
 DELIVERY_OPTIONS = {
     "formats": "deliver.formats",

@@ -138,6 +138,8 @@ class Source:
                     demand) or "new" (unwrapped here)
     notes           sentences for the report
     lit             whether a result's unlit materials are to become lit ones (glTF)
+    displacement    how far the vertices were moved from the file's, in its units and axes; user_positions have it in
+                    them. None for an unchanged mesh
     """
 
     path: Path
@@ -149,6 +151,7 @@ class Source:
     uv: str
     notes: tuple[str, ...]
     lit: bool = False
+    displacement: Float[np.ndarray, "v 3"] | None = None
 
 
 @dataclass(frozen=True)

@@ -150,6 +150,18 @@ def px_from_world(
     return cam[..., :2] / safe[..., None] * camera.focal + np.asarray(camera.centre), z
 
 
+def px_by_cam(
+    camera: Camera, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 2 3"]]:
+    """Camera coordinates of world points, and the derivative of their pixels by these coordinates."""
+    cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    z = np.maximum(cam[:, 2], 1e-6)
+    moves = np.zeros((len(cam), 2, 3))
+    moves[:, 0, 0] = moves[:, 1, 1] = 1
+    moves[:, :, 2] = -cam[:, :2] / z[:, None]
+    return cam, moves * (camera.focal / z)[:, None, None]
+
+
 def world_from_px(
     camera: Camera, px: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]
 ) -> Float[np.ndarray, "*n 3"]:

@@ -53,6 +53,17 @@ class OwnMaps(Maps):
     known: Bool[np.ndarray, "hk wk"]
 
 
+@dataclass(frozen=True)
+class Heights:
+    """Displacement along the normal, one map per texture set, in the units of the mesh's file.
+
+    `scale` is the range of 16-bit files: a value v (0..1) is the displacement (v - 0.5) scale.
+    """
+
+    maps: tuple[Float[np.ndarray, "_ _"], ...]
+    scale: float
+
+
 FINER = 4  # texels along a side of the atlas per pixel along a side of the picture, beyond which nothing is gained
 
 

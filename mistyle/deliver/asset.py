@@ -3,6 +3,7 @@
     <name>.glb                                       the asset with its textures inside
     textures/<name>_{albedo,normal,roughness,orm}.png   8 bits: albedo sRGB, the others linear
     textures/<name>_{albedo,normal,roughness,orm}.exr   16-bit float: albedo linear Rec.709, the others data
+    textures/<name>_height.{png,exr}                    on request: 16 bits about 0.5, and float in the mesh's units
     <name>.json                                      every file with its sha256, size, colour space and meaning
 
 With several parts (texture sets) the textures are called <name>_<part>_<map>.
@@ -20,7 +21,7 @@ from mistyle import __version__
 from mistyle.atlas.texels import corner_weights
 from mistyle.core.asset import Asset
 from mistyle.core.image import nearest_fill
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Heights, Maps, Texels
 from mistyle.core.names import checked
 from mistyle.geometry.retexture import fetch
 from mistyle.io.gltf.alpha import Cutout, cutouts
@@ -47,6 +48,7 @@ CHANNELS = {
     "roughness": "perceptual roughness (GGX alpha = roughness squared)",
     "orm": "R ambient occlusion (1 is open), G roughness, B metallic",
 }
+HEIGHT = "displacement along the normal: (value - middle) x scale, in the units of the mesh"
 
 
 def write_asset(
@@ -70,6 +72,7 @@ def write_sets(
     sets: Iterable[tuple[Maps, Float[np.ndarray, "h w"], Texels]],
     *,
     provenance: dict[str, Any],
+    heights: Heights | None = None,
 ) -> dict[str, Any]:
     """Write GLB, textures and the list of files into `folder`; returns the list (the content of <name>.json).
 
@@ -86,13 +89,15 @@ def write_sets(
     result: dict[str, Any] = {}
 
     def fill(new: Path) -> None:
-        result.update(_write(new, name, asset, sets, provenance))
+        result.update(_write(new, name, asset, sets, provenance, heights))
 
     put_folder(folder, fill, lambda target: _earlier(target, name))
     return result
 
 
-def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any]) -> dict[str, Any]:
+def _write(
+    new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any], heights: Heights | None
+) -> dict[str, Any]:
     stems = part_stems(name, asset.mesh.parts)
     alpha_by_part = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
     pictures: list[Pictures] = []
@@ -102,6 +107,7 @@ def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any])
         # No variable of the loop holds a set: its memory is free before the next one is computed.
         encoded, written = _write_set(new, stem, asset, alpha_by_part.get(part), next(remaining))
         pictures.append(encoded)
+        written += [] if heights is None else _write_height(new / "textures", stem, heights.maps[part], heights.scale)
         files += [_entry(new, path, part=asset.mesh.parts[part], **about) for path, about in written]
     write = patch_glb if asset.source.kind in ("glb", "gltf") else write_glb
     glb = new / f"{name}.glb"
@@ -169,6 +175,18 @@ def _write_textures(
         result.append((png, about | {"bits": 8}))
         result.append((exr, about | {"bits": 16}))
     return result
+
+
+def _write_height(folder: Path, stem: str, height: np.ndarray, scale: float) -> list[tuple[Path, dict[str, Any]]]:
+    """The height map of one part: 16-bit PNG about its middle, and float EXR in the units of the mesh."""
+    png, exr = folder / f"{stem}_height.png", folder / f"{stem}_height.exr"
+    write_png(png, np.clip(height / np.float32(scale) + np.float32(0.5), 0, 1), bits=16)
+    write_exr(exr, {"Y": height}, attributes={"mistyle:map": "height", "colorInteropID": "data"})
+    about = {"map": "height", "what": HEIGHT, "size": [height.shape[1], height.shape[0]]}
+    return [
+        (png, about | {"bits": 16, "middle": 0.5, "scale": scale}),
+        (exr, about | {"bits": 32, "middle": 0.0, "scale": 1.0}),
+    ]
 
 
 def _entry(folder: Path, path: Path, **about: Any) -> dict[str, Any]:

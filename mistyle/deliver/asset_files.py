@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Heights, Maps, Texels
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs.edits import Edited
 from mistyle.jobs.progress import Report
@@ -23,13 +23,15 @@ def write(
     report: Report,
     edited: Edited,
     own: int = 0,
+    heights: Heights | None = None,
 ) -> None:
     """Write the asset, one texture set after another; `edited` holds textures that a person painted over, `own` is
-    that of `pad_maps`."""
+    that of `pad_maps`; `heights` are written as they are."""
     from mistyle.deliver.asset import write_sets
 
     merged = {**provenance, **edited.provenance}
-    write_sets(folder, job.name, asset, _finished(job, asset, sets, report, edited, own), provenance=merged)
+    finished = _finished(job, asset, sets, report, edited, own)
+    write_sets(folder, job.name, asset, finished, provenance=merged, heights=heights)
 
 
 def _finished(

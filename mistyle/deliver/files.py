@@ -21,8 +21,8 @@ from mistyle.core.names import (
 )
 from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.images.ocio import ColourSpace, exr_tags
-from mistyle.io.images.packing import TARGETS, Target, TextureSet, write_slot
-from mistyle.io.materialx import TexturedMaterial, write_materialx
+from mistyle.io.images.packing import FILM_HEIGHT, HEIGHT, TARGETS, Target, TextureSet, write_slot
+from mistyle.io.materialx import HeightFile, TexturedMaterial, write_materialx
 from mistyle.io.meshes.obj_write import write_obj
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
@@ -60,6 +60,8 @@ def write_delivery(folder: Path, out: Path, finished: FinishedAsset, chosen: Del
     target = TARGETS[chosen.target]
     referring = any(f in chosen.formats for f in ("usd", "mtlx", "obj"))
     slots = _slots(chosen.formats, target, referring)
+    if slots and all(s.height is not None for s in finished.sets):
+        slots.append(FILM_HEIGHT if target.slots[0].ext == "exr" else HEIGHT)
     pattern = _tiled(chosen.textures, finished.sets)
     labels = set_labels(pattern, chosen.name, finished)
     files = _texture_files(pattern, labels, finished.sets, slots, target, referring)
@@ -70,6 +72,7 @@ def write_delivery(folder: Path, out: Path, finished: FinishedAsset, chosen: Del
             write_slot(folder / "textures" / file, slot, textures, chosen.space)
             about = {"map": slot.map, "colour": slot.colour, "bits": slot.bits, "set": textures.name}
             about |= {"space": exr_tags(chosen.space)["colorInteropID"]} if slot.colour == "linear" else {}
+            about |= height_of(slot, textures)
             about |= {"normal": "-Y (DirectX)" if down else "+Y (OpenGL)"} if slot.map == "normal" else {}
             written.append({"file": f"textures/{file}", **about})
     shared = []
@@ -106,6 +109,13 @@ def notes(finished: FinishedAsset, chosen: Delivery) -> tuple[str, ...]:
     if not turned or "obj" not in chosen.formats:
         return ()
     return (f"{chosen.name}.obj has Y up, which OBJ cannot state. {turned[0]}",)
+
+
+def height_of(slot: Any, textures: TextureSet) -> dict[str, float]:
+    """Middle and scale of a height map: displacement = (value - middle) x scale in the mesh's units."""
+    if slot.map != "height":
+        return {}
+    return {"middle": 0.5, "scale": textures.height_scale} if slot.ext == "png" else {"middle": 0.0, "scale": 1.0}
 
 
 def _is_down(slot: Any, target: Target) -> bool:
@@ -175,7 +185,12 @@ def _looks(
     looks = []
     for name, title, label, textures in zip(names, titles, labels, finished.sets, strict=True):
         files = [f"textures/{texture_name(pattern, label, textures.tile, m, 'exr' if exr else 'png')}" for m in SINGLE]
-        looks.append(TexturedMaterial(name, *files, srgb=not exr, space=chosen.space, title=title))
+        raised = next((slot for slot in slots if slot.map == "height"), None)
+        bump = None
+        if raised is not None:
+            file = f"textures/{texture_name(pattern, label, textures.tile, 'height', raised.ext)}"
+            bump = HeightFile(file, **height_of(raised, textures))
+        looks.append(TexturedMaterial(name, *files, srgb=not exr, space=chosen.space, title=title, height=bump))
     return looks
 
 

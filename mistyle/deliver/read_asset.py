@@ -39,7 +39,8 @@ def read_finished(place: Path) -> FinishedAsset:
         raise InputRefused(
             f"{glb}: found {len(asset.mesh.parts)} texture sets, {name}.json lists {len(stems)}; run the job again"
         )
-    sets = [_texture_set(folder / "textures", part, stem) for part, stem in stems]
+    scales = {e.get("file"): float(e["scale"]) for e in manifest["files"] if e.get("map") == "height"}
+    sets = [_texture_set(folder / "textures", part, stem, scales) for part, stem in stems]
     return FinishedAsset(asset, tuple(sets), manifest, folder)
 
 
@@ -74,13 +75,14 @@ def _listing(place: Path) -> Path:
     )
 
 
-def _texture_set(folder: Path, part: str, stem: str) -> TextureSet:
+def _texture_set(folder: Path, part: str, stem: str, scales: Mapping[str, float]) -> TextureSet:
     from mistyle.io.read import read_exr, read_picture
 
     def planes(kind: str) -> Mapping[str, np.ndarray]:
         return read_exr(folder / f"{stem}_{kind}.exr")
 
     albedo, normal, roughness, orm = (planes(kind) for kind in ("albedo", "normal", "roughness", "orm"))
+    scale = scales.get(f"textures/{stem}_height.png")
     tile = re.search(r"\.(1\d{3})$", part)
     rgb = np.stack([albedo[c] for c in "RGB"], axis=-1)
     # Other programs read the PNG, which may hold edits; where it differs, it replaces the EXR.
@@ -96,4 +98,6 @@ def _texture_set(folder: Path, part: str, stem: str) -> TextureSet:
         metallic=orm["B"],
         occlusion=orm["R"],
         alpha=albedo.get("A"),
+        height=None if scale is None else planes("height")["Y"],
+        height_scale=scale or 1.0,
     )

@@ -139,10 +139,10 @@ def _obj(path: Path) -> dict[str, list[str]]:
 
 
 def _materialx(path: Path) -> dict[str, list[str]]:
-    """The images in the node graph of every material's surface."""
+    """The images in the node graph of every material's surface and displacement."""
     root, place = ElementTree.parse(path).getroot(), "image/input[@name='file']"
     graphs = {g.get("name"): [i.get("value", "") for i in g.iterfind(place)] for g in root.iterfind("nodegraph")}
-    shaders = root.iterfind("open_pbr_surface")
+    shaders = [*root.iterfind("open_pbr_surface"), *root.iterfind("displacement")]
     surfaces = {s.get("name"): [i.get("nodegraph") for i in s if i.get("nodegraph")] for s in shaders}
     result = {}
     for material in root.iterfind("surfacematerial"):

@@ -16,6 +16,15 @@ from mistyle.io.store.atomic import atomic_write
 
 
 @dataclass(frozen=True)
+class HeightFile:
+    """A height map: the displacement along the normal is (value - middle) scale, in the mesh's units."""
+
+    file: str
+    middle: float
+    scale: float
+
+
+@dataclass(frozen=True)
 class TexturedMaterial:
     """A material and its images: file names as the document names them. The albedo is sRGB, or linear in `space` (None:
     linear Rec.709). `name` is an identifier (core/names.py); `title` is the user's name for it, or ""."""
@@ -28,6 +37,7 @@ class TexturedMaterial:
     srgb: bool = True
     space: ColourSpace | None = None
     title: str = ""
+    height: HeightFile | None = None
 
 
 def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
@@ -35,9 +45,9 @@ def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
     root = Element("materialx", version="1.39", colorspace="lin_rec709")
     names = [look.name for look in looks]
     # Names are unique in the document: a material's own name may be SR_….
-    every = distinct([*names, *(f"NG_{n}" for n in names), *(f"SR_{n}" for n in names)])
-    rows = zip(looks, every[len(names) : 2 * len(names)], every[2 * len(names) :], strict=True)
-    for look, graph_name, surface_name in rows:
+    every = distinct([*names, *(f"{kind}_{n}" for kind in ("NG", "SR", "DS") for n in names)])
+    graphs, surfaces, moves = (every[k * len(names) : (k + 1) * len(names)] for k in (1, 2, 3))
+    for look, graph_name, surface_name, move_name in zip(looks, graphs, surfaces, moves, strict=True):
         graph = SubElement(root, "nodegraph", name=graph_name)
         colour = _image(graph, "albedo", "color3", look.albedo)
         colour.set("colorspace", "srgb_texture" if look.srgb else materialx_space(look.space))
@@ -67,9 +77,27 @@ def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
         if look.title not in ("", look.name):
             material.set("doc", look.title)
         SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename=surface_name)
+        if look.height is not None:
+            _displaced((root, graph, material), (graph_name, move_name), look.height)
     ElementTree.indent(root, "  ")
     text = ElementTree.tostring(root, encoding="unicode")
     atomic_write(path, f'<?xml version="1.0"?>\n{text}\n'.encode())
+
+
+def _displaced(where: tuple[Element, Element, Element], names: tuple[str, str], height: HeightFile) -> None:
+    """The displacement of a material: its height map about its middle, scaled to the mesh's units. `where` are the
+    document, the material's graph and the material; `names` those of the graph and of the displacement."""
+    (root, graph, material), (graph_name, name) = where, names
+    _image(graph, "height", "float", height.file)
+    middle = SubElement(graph, "subtract", name="height_about_middle", type="float")
+    SubElement(middle, "input", name="in1", type="float", nodename="image_height")
+    SubElement(middle, "input", name="in2", type="float", value=f"{height.middle:.9g}")
+    SubElement(graph, "output", name="out_height", type="float", nodename="height_about_middle")
+    shader = Element("displacement", name=name, type="displacementshader")
+    root.insert(list(root).index(material), shader)
+    SubElement(shader, "input", name="displacement", type="float", nodegraph=graph_name, output="out_height")
+    SubElement(shader, "input", name="scale", type="float", value=f"{height.scale:.9g}")
+    SubElement(material, "input", name="displacementshader", type="displacementshader", nodename=name)
 
 
 def _image(graph: Element, name: str, kind: str, file: str) -> Element:

@@ -26,7 +26,7 @@ from mistyle.io.store.trusted_json import read_own
 EDITABLE = {
     "stylized": re.compile(r"[^/]+\.(png|exr|jpe?g|webp|tiff?)"),
     "masks": re.compile(r"[^/]+\.png"),
-    "asset": re.compile(r"textures/[^/]+\.(png|exr)"),
+    "asset": re.compile(r"textures/[^/]+(?<!_height)\.(png|exr)"),
 }
 # Stage -> the consequence of an edit, for the note to the user.
 REDONE = {

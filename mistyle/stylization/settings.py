@@ -13,6 +13,7 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.jobs import settings
 from mistyle.jobs.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.jobs.job_settings import ReadSettings, ReportSettings
+from mistyle.solver.shape.settings import DisplaceSettings
 from mistyle.stylization.diffusion.settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
 from mistyle.stylization.inpaint.settings import RepairSettings
 from mistyle.stylization.mvst.settings import SweepSettings
@@ -78,6 +79,7 @@ class Settings(BaseModel):
     atlas: AtlasSettings = AtlasSettings()
     bake: BakeSettings = BakeSettings()
     finish: FinishSettings = FinishSettings()
+    displace: DisplaceSettings = DisplaceSettings()
     fit: FitSettings = FitSettings()
     repair: RepairSettings = RepairSettings()
     report: ReportSettings = ReportSettings()

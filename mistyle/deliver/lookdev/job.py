@@ -21,6 +21,7 @@ from mistyle.core.asset import Asset
 from mistyle.core.errors import MistyleError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.deliver.lookdev.canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
+from mistyle.deliver.lookdev.shape import ASIDE, reshaped
 from mistyle.io.store.atomic import atomic_write, sha256_file
 from mistyle.io.store.output import claim, replace_files
 from mistyle.jobs.progress import Progress
@@ -50,11 +51,13 @@ class LookSettings(BaseModel):
 
 @dataclass(frozen=True)
 class SheetSubject:
-    """The subject of a sheet: the asset, its file, and pictures of the run's texel data per texture set."""
+    """The subject of a sheet: the asset, its file, pictures of the run's texel data per texture set, and, for a
+    displaced mesh, the mesh before and after with the azimuth of the change."""
 
     asset: Asset
     path: Path
     known: dict[str, list[np.ndarray]]
+    shapes: tuple[tuple[Asset, Asset], float] | None = None
 
 
 def lookdev(
@@ -156,7 +159,7 @@ def read_subject(place: Path) -> SheetSubject:
     path = finished_asset(place) if place.is_dir() else place
     asset = read_mesh(path)
     known = texel_knowledge(place, len(asset.mesh.parts)) if place.is_dir() else {}
-    return SheetSubject(asset, path, known)
+    return SheetSubject(asset, path, known, reshaped(place) if place.is_dir() else None)
 
 
 def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
@@ -231,7 +234,22 @@ def sheet(
         PanelRow("AOVs", tuple(strip)),
         PanelRow(f"{lights[2].name}, turned about the asset", tuple(turned)),
     )
+    if subject.shapes is not None:
+        rows = (*rows, shape_row(subject.shapes, lights[1].light, settings, panel_widths(4, width, gutter)))
     return Sheet(subject.path.stem, facts(subject), rows, burn_in(subject, settings, day)), width, scale
+
+
+def shape_row(shapes: tuple[tuple[Asset, Asset], float], key: Any, settings: LookSettings, size: int) -> PanelRow:
+    """The mesh before and after its displacement, from the changed view and from aside."""
+    from mistyle.render.lookdev import sheet as drawing
+
+    (pair, azimuth), panels = shapes, []
+    stages = [(name, drawing.Stage(asset)) for name, asset in zip(("before", "after"), pair, strict=True)]
+    for angle in (azimuth, azimuth + ASIDE):
+        for name, stage in stages:
+            picture = stage.picture(angle, 0.0, key, size, settings.spp, settings.seed)
+            panels.append(Panel(drawing.over(picture, (PANEL,) * 3), name, f"{angle % 360:.0f}°"))
+    return PanelRow("The displaced mesh as clay under the hard key", tuple(panels))
 
 
 def on_panel(picture: np.ndarray) -> np.ndarray:

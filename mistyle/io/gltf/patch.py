@@ -1,7 +1,8 @@
 """Writer of a user's glTF with new textures and otherwise unchanged content.
 
 Nodes, names, skins, animations, cameras, extras and extensions are copied unchanged, vertex attributes byte by byte.
-These change: textures of the painted materials, and TANGENT (MikkTSpace) of the painted primitives. Their COLOR_0 is
+These change: textures of the painted materials, and TANGENT (MikkTSpace) of the painted primitives; after a
+displacement also POSITION and NORMAL (`displaced.py`). Their COLOR_0 is
 removed, since viewers would multiply the painting by it (it is part of the albedo). A mesh that was unwrapped anew, or
 whose texture coordinates were transformed, gets the next free TEXCOORD set. Where corners of one vertex need different
 tangents or texture coordinates, copies of the vertex are appended, so old vertex indices stay valid. The
@@ -19,6 +20,7 @@ from mistyle import __version__
 from mistyle.core.asset import Asset, Primitive
 from mistyle.core.errors import MistyleError
 from mistyle.io.gltf.alpha import image_bytes
+from mistyle.io.gltf.displaced import displaced_buffers
 from mistyle.io.gltf.glb import TRIANGLES, Buffers, Builder, Tree, values
 from mistyle.io.gltf.infos import shadeless
 from mistyle.io.gltf.tidy import drop_unused
@@ -39,6 +41,8 @@ def patch_tree(asset: Asset, pictures: Sequence[Pictures], *, name: str, provena
     """
     tree, buffers = load_gltf(asset.source.path)
     tree = copy.deepcopy(tree)
+    if asset.source.displacement is not None:
+        buffers = displaced_buffers(tree, buffers, asset)
     builder = Builder(tree, buffers)
     patches = _with_texcoords(tree, buffers, _separate_nodes(tree, _patches(tree, buffers, asset)))
     repeating = _repeating(tree, buffers, patches)

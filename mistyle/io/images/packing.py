@@ -24,7 +24,8 @@ Image = Float[np.ndarray, "h w"] | Float[np.ndarray, "h w c"]
 class TextureSet:
     """The finished maps of one texture set, row 0 = v 1; `tile` is its UDIM tile (1001 for a single tile).
 
-    albedo linear Rec.709; normal encoded (n + 1) / 2, +Y; roughness, metallic and occlusion 0..1; alpha or None
+    albedo linear Rec.709; normal encoded (n + 1) / 2, +Y; roughness, metallic and occlusion 0..1; alpha or None;
+    height (or None) in the mesh's units, of which 16-bit files hold the range `height_scale` about their middle
     """
 
     name: str
@@ -35,6 +36,8 @@ class TextureSet:
     metallic: Float[np.ndarray, "h w"]
     occlusion: Float[np.ndarray, "h w"]
     alpha: Float[np.ndarray, "h w"] | None = None
+    height: Float[np.ndarray, "h w"] | None = None
+    height_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,17 @@ def _hdrp(s: TextureSet) -> Image:
     return _stacked(s.metallic, s.occlusion, np.zeros_like(s.metallic), 1 - s.roughness)
 
 
+def _height(s: TextureSet) -> Image:
+    return _in_units(s) / np.float32(s.height_scale) + np.float32(0.5)
+
+
+def _in_units(s: TextureSet) -> Image:
+    assert s.height is not None
+    return s.height
+
+
+# For assets with a height map: 16 bits about 0.5, or the mesh's units for film renderers.
+HEIGHT, FILM_HEIGHT = Slot("height", _height, "data", 16), Slot("height", _in_units, "data", 16, "exr")
 ALBEDO = Slot("albedo", _encoded, "srgb", 8)
 NORMAL = Slot("normal", lambda s: s.normal, "data", 8)
 OCCLUSION = Slot("occlusion", lambda s: s.occlusion, "data", 8)

@@ -110,6 +110,8 @@ def define_material(pxr: Any, stage: Any, place: str, look: TexturedMaterial, pr
         ("metallic", look.metallic, "r", pxr.Sdf.ValueTypeNames.Float, "raw"),
         ("normal", look.normal, "rgb", pxr.Sdf.ValueTypeNames.Normal3f, "raw"),
     )
+    if look.height is not None:
+        sockets += (("displacement", look.height.file, "r", pxr.Sdf.ValueTypeNames.Float, "raw"),)
     for name, file, channel, kind, space in sockets:
         texture = _shader(pxr, stage, f"{place}/{name}", "UsdUVTexture")
         file_input = texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset)
@@ -125,11 +127,18 @@ def define_material(pxr: Any, stage: Any, place: str, look: TexturedMaterial, pr
             # n = 2 c - 1, which 8-bit files require.
             texture.CreateInput("scale", pxr.Sdf.ValueTypeNames.Float4).Set((2, 2, 2, 1))
             texture.CreateInput("bias", pxr.Sdf.ValueTypeNames.Float4).Set((-1, -1, -1, 0))
+        if name == "displacement" and look.height is not None:
+            scale, middle = look.height.scale, look.height.middle
+            texture.CreateInput("scale", pxr.Sdf.ValueTypeNames.Float4).Set((scale,) * 4)
+            texture.CreateInput("bias", pxr.Sdf.ValueTypeNames.Float4).Set((-middle * scale,) * 4)
         output = texture.CreateOutput(
             channel, pxr.Sdf.ValueTypeNames.Float3 if len(channel) > 1 else pxr.Sdf.ValueTypeNames.Float
         )
         surface.CreateInput(name, kind).ConnectToSource(output)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", pxr.Sdf.ValueTypeNames.Token))
+    if look.height is not None:
+        moves = surface.CreateOutput("displacement", pxr.Sdf.ValueTypeNames.Token)
+        material.CreateDisplacementOutput().ConnectToSource(moves)
     return material
 
 

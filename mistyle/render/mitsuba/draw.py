@@ -71,7 +71,7 @@ def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
     device.use()
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
     height, width = camera.size
-    directions, cosines = _directions(camera)
+    directions, cosines = _directions(camera, pixel_centres(camera.size).reshape(-1, 2))
     # Opaque: a literal would compile one kernel per camera.
     origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.position))
     ray = mi.Ray3f(origin, mi.Vector3f(aligned(directions.T)))
@@ -99,9 +99,21 @@ def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
     )
 
 
-def _directions(camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Unit world directions through the pixel centres, row by row, and their cosine with the optical axis."""
-    x, y = ((pixel_centres(camera.size).reshape(-1, 2) - np.asarray(camera.centre)) / camera.focal).T
+def misses(traced: Tracer, camera: Camera, px: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
+    """Whether the rays through pixel coordinates (x, y) miss the mesh."""
+    import drjit as dr
+    import mitsuba as mi
+
+    origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.position))
+    ray = mi.Ray3f(origin, mi.Vector3f(aligned(_directions(camera, px)[0].T)))
+    return ~np.array(traced.scene.ray_test(ray)).astype(bool)
+
+
+def _directions(
+    camera: Camera, px: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Unit world directions through pixels (x, y), and their cosine with the optical axis."""
+    x, y = ((px - np.asarray(camera.centre)) / camera.focal).T
     cosines = 1 / np.sqrt(1 + x * x + y * y)
     # Written out: for so small a matrix, waking the BLAS's threads dominates.
     rows = [(a * x + b * y + c) * cosines for a, b, c in camera.world_from_cam[:3, :3]]

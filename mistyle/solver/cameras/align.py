@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from mistyle.core.camera import Camera
+from mistyle.core.camera import Camera, px_by_cam
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance
 from mistyle.core.mesh import Mesh
@@ -211,16 +211,6 @@ def _distances(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> tu
     return tuple(times * _distance(traced, moved_camera(camera, matrix), mask) for camera, mask, times in views)
 
 
-def _rows(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Camera coordinates (n 3) of points, and the derivative of their pixels (n 2 3)."""
-    cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
-    z = np.maximum(cam[:, 2], 1e-6)
-    moves = np.zeros((len(cam), 2, 3))
-    moves[:, 0, 0] = moves[:, 1, 1] = 1
-    moves[:, :, 2] = -cam[:, :2] / z[:, None]
-    return cam, moves * (camera.focal / z)[:, None, None]
-
-
 def _rotation_jacobian(points: np.ndarray) -> np.ndarray:
     """d (w x p) / d w = -[p]x, (n 3 3)."""
     x, y, z = points.T
@@ -241,7 +231,7 @@ def _rim_rows(
     slope = slope_of(distance)[rim]
     residual = (distance - signed_distance(hits.mask))[rim]
     points = hits.position[rim].astype(float)
-    cam, moves = _rows(camera, points)
+    cam, moves = px_by_cam(camera, points)
     return points, cam, residual, np.einsum("nk,nkj->nj", slope, moves)
 
 
@@ -324,7 +314,7 @@ def _shading_rows(traced: Tracer, camera: Camera, times: int, shading: _Shading)
     scale = float(np.sqrt((slope**2).sum(axis=1).mean()))
     if scale < 1e-9:
         return np.zeros((0, 6)), np.zeros(0)
-    cam, moves = _rows(camera, hits.position[inner].astype(float))
+    cam, moves = px_by_cam(camera, hits.position[inner].astype(float))
     by_cam = np.einsum("nk,nkj->nj", slope, moves) / scale
     jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotation_jacobian(cam)), by_cam], axis=1)
     return jacobian, (seen - gain * drawn)[inner] / scale

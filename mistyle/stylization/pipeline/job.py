@@ -26,7 +26,9 @@ FIRST = {"first asset": "write the first asset"}
 RETOUCH = {"retouch": "bake the edited views"}
 # Only with --finish.
 FINISH = {"finish": "finish the painting"}
-EVERY_STAGE = STAGES | RETOUCH | FINISH
+# Only with --displace or --height-map.
+DISPLACE = {"displace": "displace the mesh to the outlines", "height": "look up the painting's height"}
+EVERY_STAGE = STAGES | RETOUCH | FINISH | DISPLACE
 # Those of `mistyle stylize --preview`.
 PREVIEW_STAGES = {name: STAGES[name] for name in ("mesh", "texels", "surface")} | {"preview": "draw the preview"}
 

@@ -139,7 +139,7 @@ def raised(
 ) -> tuple[list[Maps], list[Maps]]:
     """The painted maps, and the same with the painting's relief added to their normals and its gloss to their
     roughness."""
-    height = HEIGHT if settings.paint.height is None else settings.paint.height
+    height = relief_slope(settings)
     gloss = GLOSS if settings.paint.gloss is None else settings.paint.gloss
     both = [_laid(asset, layers, atlas, settings, part, (height, gloss)) for part in range(len(atlas.texels))]
     return [flat for flat, _ in both], [bent for _, bent in both]
@@ -187,6 +187,11 @@ def _laid(
         kept = painted_mask(settings.paint.protect, texels)
         flat, bent = (protected(maps, start, kept) for maps in (flat, bent))
     return flat, bent
+
+
+def relief_slope(settings: Settings) -> float:
+    """Slope (root mean square) of the painting's relief."""
+    return HEIGHT if settings.paint.height is None else settings.paint.height
 
 
 def pieces(at: np.ndarray) -> Iterator[slice]:

@@ -51,7 +51,9 @@ def retouch(
     for k, file in touched.items():
         rendered = before[k] if file.endswith(".exr") else _as_written(folder, views[k], before[k])
         lossy = file.lower().endswith((".jpg", ".jpeg", ".webp")) or views[k].camera.size != sizes[k]
-        new = differs(views[k], rendered, *(LOSSY if lossy else EXACT))
+        # On a displaced mesh new surface lies where the picture had none.
+        fresh = traced[k].mask & (rendered.coverage == 0)
+        new = differs(views[k], rendered, *(LOSSY if lossy else EXACT)) | fresh
         brushes.append(_without_light(replace(traced[k], mask=traced[k].mask & new), baked.gains[k : k + 1]))
     painted, begun = [], []
     for part, (texels, maps) in enumerate(zip(atlas.texels, baked.maps, strict=True)):

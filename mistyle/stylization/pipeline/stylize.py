@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Heights, Maps, Texels
 from mistyle.core.view import View
 from mistyle.deliver import asset_files
 from mistyle.io.images.textures import part_stems
@@ -23,6 +23,8 @@ from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import mesh_stage, start_engines
 from mistyle.measure.baked_light import BakedLight
+from mistyle.stylization.displace.height import check_height
+from mistyle.stylization.displace.stage import Reshaped, check_displace, displace_stage, height_stage
 from mistyle.stylization.optimise.light_left import light_left
 from mistyle.stylization.pipeline.budget import PLAIN, STYLED, TILED, counts
 from mistyle.stylization.pipeline.finishing import FinishRecord, check_finish, finish_stage
@@ -42,6 +44,7 @@ from mistyle.stylization.pipeline.painting import (
     bake,
     check_paint,
     paint_files,
+    relief_slope,
     stylized_stage,
     surface_stage,
     unlit_views,
@@ -69,6 +72,7 @@ class StylizedJob:
     looks: tuple[StyleLook, ...]
     light: BakedLight | None
     finishing: FinishRecord | None = None
+    reshaped: Reshaped | None = None
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -89,6 +93,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     check_paint(job.settings.paint)
     check_generative(job.settings, progress.say)
     check_finish(job.settings)
+    check_height(job.settings, relief_slope(job.settings))
     if job.settings.stylizer != "embedded":
         from mistyle.stylization.pipeline.sweep import refuse_unsupported
 
@@ -122,14 +127,20 @@ def inputs_of(job: Job) -> list[Path]:
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> StylizedJob:
     s = run.job.settings
     asset = mesh_stage(run, files)
+    check_displace(run, asset)
     look_again(*size_of(asset))
     atlas = texels_stage(run, asset)
     views = views_stage(run, asset, atlas)
     looks = style_looks(style, run.job.style.name, s, run.progress)
     baked, stylized, finishing = painted_stages(run, asset, style, atlas, views, looks)
-    painted = ["bake", "stylized"]
+    painted, reshaped = ["bake", "stylized"], None
+    heights = height_stage(run, asset, atlas)
+    if s.displace.most > 0:
+        reshaped = displace_stage(run, asset, atlas, baked, stylized)
+        asset, atlas, stylized = reshaped.asset, reshaped.atlas, reshaped.stylized
+        painted.append("displace")
     if "stylized" in run.edited:
-        baked, stylized = retouched_stage(run, asset, atlas, baked, stylized)
+        baked, stylized = retouched_stage(run, asset, atlas, baked, stylized, painted)
         painted = ["retouch"]
     if s.keeps_painting:
         run.skip(REFINING, painted)
@@ -140,16 +151,18 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
 
     def write(folder: Path, edited: Edited, report: Report) -> None:
         sets = zip(atlas.texels, repaired.maps, strict=True)
-        write_asset(folder, run.job, asset, sets, report, edited)
+        write_asset(folder, run.job, asset, sets, report, edited, heights)
 
-    folder, edited = asset_stage(run, ["repair"], write, {"painted": run.keys["bake"]})
+    after = ["repair"] if heights is None else ["repair", "height"]
+    folder, edited = asset_stage(run, after, write, {"painted": run.keys["bake"]})
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
     light = light_left(asset.mesh, atlas.texels, repaired.maps, s.seed)
     return StylizedJob(
-        run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light, finishing
-    )
+        run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light, finishing,
+        reshaped,
+    )  # fmt: skip
 
 
 def refined_stages(
@@ -182,7 +195,7 @@ def refined_stages(
 
 
 def retouched_stage(
-    run: Run, asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View]
+    run: Run, asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View], after: Sequence[str]
 ) -> tuple[Baked, Sequence[View]]:
     """The stage "retouch": user edits of the stylized views, baked into the texture and the other views."""
     from mistyle.stylization.pipeline.retouch import retouch
@@ -190,7 +203,7 @@ def retouched_stage(
     s, edited, folder = run.job.settings, run.edited["stylized"], run.visible.root / "stylized"
     retouched = run.record(
         "retouch",
-        ["bake", "stylized"],
+        after,
         [s.bake],
         lambda r: retouch(asset, atlas, baked, stylized, edited, folder, s, r),
     )
@@ -364,7 +377,8 @@ def write_asset(
     sets: Iterable[tuple[Texels, Maps]],
     report: Report,
     edited: Edited = UNEDITED,
+    heights: Heights | None = None,
 ) -> None:
     """Write the delivered files, set after set; `edited` holds textures that a user painted over."""
     provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed}
-    asset_files.write(folder, job, asset, sets, provenance, report, edited)
+    asset_files.write(folder, job, asset, sets, provenance, report, edited, heights=heights)

@@ -29,7 +29,7 @@ from mistyle.jobs.report.turntable import write_turn
 from mistyle.jobs.versions import versions
 from mistyle.stylization.optimise.judge import TOLERANCE, regressed, undone_where
 from mistyle.stylization.pipeline.finishing import finish_pair
-from mistyle.stylization.pipeline.job import FINISH, FIRST, RETOUCH, STAGES
+from mistyle.stylization.pipeline.job import DISPLACE, FINISH, FIRST, RETOUCH, STAGES
 from mistyle.stylization.report.style_reading import look_facts
 from mistyle.stylization.report.summary import MEANINGS, figures
 
@@ -58,7 +58,7 @@ def job_report(folder: Path, result: Any, progress: Progress, report: Callable[[
         write_png(folder / "beauty.png", best)
     write_png(folder / "overview.png", side_by_side([bare, result.style.rgb, best]))
     report(0.8)
-    named = STAGES | RETOUCH | FINISH | FIRST
+    named = STAGES | RETOUCH | FINISH | FIRST | DISPLACE
     page = Report(
         title=result.job.name,
         mesh=result.job.mesh.name,
@@ -149,7 +149,8 @@ def steps(result: Any, refined: Sequence[BeforeAfter]) -> tuple[Step, ...]:
         columns=3,
     )
     finish = () if result.finishing is None else (finish_step(result),)
-    return (views, stylized, baked, *finish, *refining(result, refined, longest))
+    shape = () if result.reshaped is None or not result.reshaped.shape.changed else (shape_step(result),)
+    return (views, stylized, baked, *finish, *shape, *refining(result, refined, longest))
 
 
 def refining(result: Any, pairs: Sequence[BeforeAfter], longest: int) -> tuple[Step, ...]:
@@ -179,6 +180,33 @@ def refining(result: Any, pairs: Sequence[BeforeAfter], longest: int) -> tuple[S
         columns=3,
     )
     return (fit, repair)
+
+
+def shape_step(result: Any) -> Step:
+    """The stage 'displace': the mesh before and after under a key light, and its account."""
+    from mistyle.stylization.displace.pictures import cameras_of, under_key
+
+    shape, settings = result.reshaped.shape, result.job.settings
+    changed = [view.camera for view in result.stylized if view.camera.name in shape.views]
+    cameras = cameras_of(changed, settings.report.resolution * 2)
+    before, after = (under_key(a.mesh, cameras, settings.seed) for a in (result.reshaped.before, result.asset))
+    (was, now), moved, account = shape.overlap, shape.result.moved, shape.result
+    return Step(
+        "Shape",
+        "Vertices follow the outlines that differ from the mesh's. Fit, repair and the asset use the displaced mesh; "
+        "UVs and topology are the mesh's own.",
+        "6.2.2",
+        pairs=(
+            BeforeAfter(ReportPicture(before, "the mesh"), ReportPicture(after, "displaced"), "Clay under a key light"),
+        ),
+        facts=(
+            ("views with another outline", ", ".join(shape.views)),
+            ("overlap with these outlines", f"{was:.4f} → {now:.4f}"),
+            ("distance from them", f"{account.distance[0]:.2f} → {account.distance[1]:.2f} pixels"),
+            ("largest displacement", f"{100 * moved[1]:.2f} % of the bounding radius"),
+            ("points held by the checks", str(account.held)),
+        ),
+    )
 
 
 def finish_step(result: Any) -> Step:

@@ -55,6 +55,12 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "style_before": ("distance of VGG-19's statistics to the painting's, on held-out crops, before", "lower"),
     "style_after": ("the same after the finish", "lower"),
     "moved": ("root mean square change of the albedo by the finish, sRGB units", ""),
+    "overlap_before": (
+        "intersection over union of changed outlines with the mesh's, before displacing it",
+        "higher",
+    ),
+    "overlap_after": ("the same after the displacement", "higher"),
+    "most": ("largest displacement of a vertex, in bounding radii", ""),
     "detail": ("correlation of the render's fine lightness with the stylized views' after this phase", "higher"),
     "style": ("patch and Gram distance of the render to the stylized views after this phase", "lower"),
     "views": ("difference of a surface point between neighbouring views, over the picture's own detail", "lower"),
@@ -80,6 +86,14 @@ def finish_figures(finishing: Any) -> dict[str, float]:
     }
 
 
+def shape_figures(reshaped: Any) -> dict[str, float]:
+    """Overlap with the changed outlines before and after, and the largest displacement; empty where no vertex moved."""
+    if reshaped is None or not reshaped.shape.changed:
+        return {}
+    (before, after), most = reshaped.shape.overlap, reshaped.shape.result.moved[1]
+    return {"displace.overlap_before": before, "displace.overlap_after": after, "displace.most": most}
+
+
 def figures(result: Any) -> dict[str, float]:
     """Quality metrics over all texture sets. An undone phase reports its metrics from before it."""
     covered = [t.covered for t in result.atlas.texels]
@@ -94,5 +108,6 @@ def figures(result: Any) -> dict[str, float]:
         "repaired_share": share(result.repaired.mask),
         **light_figures(result.light),
         **finish_figures(result.finishing),
+        **shape_figures(result.reshaped),
         **{name: pair[result.fit.kept[name.partition(".")[0]]] for name, pair in result.fit.figures.items()},
     }

@@ -167,6 +167,25 @@ def neighbours(
     return Neighbours(index, weight)
 
 
+def height(
+    surface: PaintedSurface,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    *,
+    footprint: float = 0.0,
+    device: str = "llvm",
+) -> Float[np.ndarray, " n"]:
+    """The painted height in working units whose gradient along the surface is that of `relief`, where one piece of the
+    painting continues. Pieces meet with a step, as their pictures do."""
+    pixel = surface.spacing / float(np.mean(surface.scale))
+    picture = np.repeat(reliefs.relief(surface.painting).height[..., None], 3, axis=2)
+    result = np.empty(len(positions), np.float32)
+    near = neighbours(surface, positions, normals)
+    for part, values in looked_up(surface, positions, near, picture, footprint, device):
+        result[part] = values[:, 0] * pixel
+    return result
+
+
 def looked_up(
     surface: PaintedSurface,
     positions: Float[np.ndarray, "n 3"],

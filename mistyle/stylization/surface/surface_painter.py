@@ -74,3 +74,15 @@ def surface_relief(
     from mistyle.stylization.surface.lookup import relief
 
     return relief(surface, positions, normals, footprint=footprint, device=array_module(), near=near)
+
+
+def surface_height(
+    surface: PaintedSurface,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    footprint: float = 0.0,
+) -> Float[np.ndarray, " n"]:
+    """The painted height in working units, whose gradient is that of `surface_relief`; `footprint` as there."""
+    from mistyle.stylization.surface.lookup import height
+
+    return height(surface, positions, normals, footprint=footprint, device=array_module())

@@ -21,9 +21,10 @@ DULL, SHINY = 0.3, 0.12  # roughness added at a groove, and subtracted at a stro
 
 @dataclass(frozen=True)
 class Relief:
-    """Per pixel of a painting: the slope of its height along x and y (root mean square 1 together), and the offset of
-    the roughness."""
+    """Per pixel of a painting: its height about a mean of 0 (pixels), the slope of that along x and y (root mean square
+    1 together), and the offset of the roughness."""
 
+    height: Float[np.ndarray, "h w"]
     slope: Float[np.ndarray, "h w 2"]
     dull: Float[np.ndarray, "h w"]
 
@@ -52,4 +53,5 @@ def relief(painting: Float[np.ndarray, "h w 3"]) -> Relief:
     smooth = blurred(height, max(0.6, FINE * max(painting.shape[:2])))
     slope = np.stack([cv2.Scharr(smooth, cv2.CV_32F, 1, 0), cv2.Scharr(smooth, cv2.CV_32F, 0, 1)], axis=2) / 32
     size = float(np.sqrt((slope**2).sum(axis=2).mean()))
-    return Relief(slope / max(size, LEAST_SLOPE), DULL * groove - SHINY * crest)
+    size = max(size, LEAST_SLOPE)
+    return Relief((smooth - smooth.mean()) / size, slope / size, DULL * groove - SHINY * crest)

@@ -1,0 +1,1 @@
+"""The style reaches the geometry: vertices follow stylized outlines, and the relief becomes a height map."""
