@@ -1,8 +1,8 @@
 """The passes of a recovery: numbered units of work, each of which improves the maps, and the seconds that each takes.
 
-A recovery may end after any pass; the passes before it do not depend on where it ends. Seconds are of two quiet cores of
-an EPYC: CPU seconds of the castle's photographs and texels per second of `benchmarks/texel_speed.py`. Plan, progress and
-time limits share them.
+A recovery may end after any pass; the passes before it do not depend on where it ends. Plan, progress and time limits
+share the seconds. They are of two quiet cores of an EPYC, from CPU seconds of the castle's photographs and from
+`benchmarks/texel_speed.py`.
 """
 
 from collections.abc import Sequence
