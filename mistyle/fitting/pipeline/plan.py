@@ -29,7 +29,7 @@ from mistyle.solver.schedule import (
     SHOWN,
 )
 
-LIGHT_SECONDS = 25  # of an unknown light, of few observations whatever the pictures
+LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pictures
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
 
 
