@@ -201,6 +201,7 @@ class _Work:
         done = shares(settings, planned, size_of(context))
         for k in range(state.done, min(limits.passes or len(planned), len(planned))):
             kinds = [one.kind for one in planned[k : k + 2]]
+            state = self._prepared(state, planned[k])
             try:
                 journal.begin(arrays_of(state, context), k)
                 state = self._after(state, planned[k], self.progress.part(done[k], done[k + 1]))
@@ -270,6 +271,15 @@ class _Work:
         self.journal.earlier = {}
         return None
 
+    def _prepared(self, state: PassState, one: Pass) -> PassState:
+        """The state in which a pass begins: with the texels' estimate once they are solved."""
+        if one.kind in ("solve", "rounds") or state.estimate is not None:
+            return state
+        # The estimate of `state` stays in memory: a stop request during the pass writes its maps.
+        prepared = replace(state, estimate=self.estimate(state), solution=None)
+        self._level = None
+        return prepared
+
     def _after(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:
         """The state after a pass."""
         context, journal = self.context, self.journal
@@ -280,9 +290,6 @@ class _Work:
             start = state.solution, state.direct
             solution, direct = solution_after_rounds(self.level(), start, one, journal, progress)
             return replace(state, solution=solution, direct=direct)
-        if state.estimate is None:
-            state = replace(state, estimate=self.estimate(state), solution=None)
-            self._level = self._estimates = None
         if one.kind == "pictures":
             state = picture_pass(context, self.renderer(state), state, one, journal, progress)
             self._targets = state.direct

@@ -1,7 +1,8 @@
 """The passes of a recovery: numbered units of work, each of which improves the maps, and the seconds that each takes.
 
-A recovery may end after any pass; the passes before it do not depend on where it ends. Seconds are of two cores of a
-server, measured by `python -m benchmarks.captures`; plan, progress and time limits share them.
+A recovery may end after any pass; the passes before it do not depend on where it ends. Plan, progress and time limits
+share the seconds. They are of two quiet cores of an EPYC, from CPU seconds of the castle's photographs and from
+`benchmarks/texel_speed.py`.
 """
 
 from collections.abc import Sequence

@@ -25,7 +25,7 @@ from mistyle.jobs.settings import thread_count
 from mistyle.jobs.stages import claim_run
 from mistyle.solver.schedule import COVERED, FILLED, SHOWN
 
-LIGHT_SECONDS = 25  # of an unknown light, of few observations whatever the pictures
+LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pictures
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
 PHOTOMETRY_SECONDS = 15  # the number of points is bounded
 
