@@ -49,13 +49,13 @@ class _Transform(BaseModel):
     center: list[float] = Field(min_length=3, max_length=3)
 
 
-class _Pose(BaseModel):
+class _SfmPose(BaseModel):
     transform: _Transform
 
 
 class _NamedPose(BaseModel):
     poseId: str | int
-    pose: _Pose
+    pose: _SfmPose
 
 
 class _SfmData(BaseModel):
