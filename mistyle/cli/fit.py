@@ -98,7 +98,7 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--albedo-of",
         metavar="MASK=VALUE",
-        help="scale of an unknown light: MASK, named after a picture, is white on a surface of this albedo (0.18 or r,g,b)",
+        help="scale of an unknown light: MASK, named after a picture, is white where albedo is VALUE (0.18 or r,g,b)",
     )
     group.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white pixels are valid")
     group.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")

@@ -49,13 +49,13 @@ class _Transform(BaseModel):
     center: list[float] = Field(min_length=3, max_length=3)
 
 
-class _Pose(BaseModel):
+class _SfmPose(BaseModel):
     transform: _Transform
 
 
 class _NamedPose(BaseModel):
     poseId: str | int
-    pose: _Pose
+    pose: _SfmPose
 
 
 class _SfmData(BaseModel):
@@ -116,15 +116,15 @@ def _lens(known: _Intrinsic, from_middle: bool, where: str, path: Path) -> Lens:
         raise _unsupported(f"{len(given)} distortion parameters of '{kind}' in {where}", path)
     width, height = known.width, known.height
     if known.focalLength is not None and known.sensorWidth is not None and known.sensorWidth > 0:
-        focal = (known.focalLength / known.sensorWidth * width,) * 2
+        fx = fy = known.focalLength / known.sensorWidth * width
     else:
-        px = known.pxFocalLength if isinstance(known.pxFocalLength, list) else [known.pxFocalLength] * 2
-        focal = (px[0] or 0.0, px[-1] or 0.0) if px else (0.0, 0.0)
-    if not (focal[0] > 0 and focal[1] > 0 and np.isfinite(focal).all()):
+        px = known.pxFocalLength if isinstance(known.pxFocalLength, list) else [known.pxFocalLength]
+        fx, fy = (float(px[k] or 0) if px else 0.0 for k in (0, -1))
+    if not (fx > 0 and fy > 0 and np.isfinite(fx + fy)):
         raise refuse(path, f"no focal length in {where}", "focalLength with sensorWidth", "Export it again")
     x, y = known.principalPoint
     centre = (width / 2 + x, height / 2 + y) if from_middle else (x, y)
-    return Lens(focal, centre, (height, width), (values[0], values[1], values[2]), (values[3], values[4]))
+    return Lens((fx, fy), centre, (height, width), (values[0], values[1], values[2]), (values[3], values[4]))
 
 
 def _unsupported(found: str, path: Path) -> InputRefused:

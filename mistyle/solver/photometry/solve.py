@@ -41,6 +41,7 @@ PATTERN, SAMPLES = 0.8, 12  # least correlation of a patch with the other pictur
 PATCHES = 8  # of each picture, for the estimate by contrasts
 CONTRAST_STEPS = 4
 LOWER = 0.9
+HARMONICS = 16  # spherical harmonics up to the third order
 SHEEN = 8  # terms of `_sheen`
 REFLECTIONS = 3  # solves for levels, each with the reflections over the radiance of the last
 DARKEST = 0.2  # of the median radiance: darker points count as so bright where radiance is a divisor
@@ -184,12 +185,25 @@ def _chosen(observed: TexelObservations, values: tuple[np.ndarray, ...], light: 
     share = OBSERVATIONS / max(int(count[count > 1].sum()), 1)
     kept = np.random.default_rng(seed).random(len(observed.texel)) < share
     rows = np.flatnonzero(usable & (count[point] > 1) & kept[texel])
-    # A point, a patch and a region belong to one light.
-    own = light[seen.picture[rows]]
-    numbers = [np.unique(of[rows] * lights + own, return_inverse=True)[1] for of in (texel, patch, region)]
-    picture = seen.picture[rows].astype(np.int64)
-    values = slant[rows], away[rows], mirrored[rows], x[rows]
-    return PointSamples(seen.rgb[rows].astype(float), picture, *numbers, *values, len(light), lights)
+    own, picture = light[seen.picture[rows]], seen.picture[rows].astype(np.int64)
+
+    def numbers(of: np.ndarray) -> np.ndarray:
+        # A point, a patch and a region belong to one light.
+        return np.unique(of[rows] * lights + own, return_inverse=True)[1]
+
+    return PointSamples(
+        rgb=seen.rgb[rows].astype(float),
+        picture=picture,
+        point=numbers(texel),
+        patch=numbers(patch),
+        region=numbers(region),
+        slant=slant[rows],
+        away=away[rows],
+        mirrored=mirrored[rows],
+        x=x[rows],
+        pictures=len(light),
+        lights=lights,
+    )
 
 
 def _levels(samples: PointSamples, full: bool) -> tuple[Response, tuple[float, float, float]]:
@@ -222,9 +236,9 @@ def _reflecting(samples: PointSamples, columns: Sequence[Any], ridge: Sequence[S
     value = np.full(3 * (int(samples.point.max()) + 1), np.exp(np.median(y)))
     # Lights that shine one at a time have no reflections in common.
     for _ in range(REFLECTIONS if samples.lights == 1 else 1):
-        reflections = _reflections(samples, value) if samples.lights == 1 else []
+        reflections = [_reflections(samples, value)] if samples.lights == 1 else []
         matrix = sparse.csr_array(sparse.hstack([*columns, *reflections]))
-        penalty = np.concatenate([*ridge, np.full(sum(part.shape[1] for part in reflections), 1e-4)])
+        penalty = np.concatenate([*ridge, np.full(3 * HARMONICS * len(reflections), 1e-4)])
         fitted = solve(matrix, y, weight, point, np.tile(samples.region, 3), penalty)
         value = np.exp(fitted.point)
     return fitted
@@ -259,13 +273,13 @@ def _logarithms(rgb: Float[np.ndarray, "o 3"]) -> tuple[np.ndarray, np.ndarray]:
     return np.log(rgb).T.ravel(), weight.T.ravel()
 
 
-def _reflections(samples: PointSamples, value: Float[np.ndarray, " p"]) -> list[sparse.csr_array]:
+def _reflections(samples: PointSamples, value: Float[np.ndarray, " p"]) -> sparse.csr_array:
     """Columns of each channel's reflected radiance over the radiance `value` of the points."""
     least = DARKEST * float(np.median(value))
     fresnel = 1 + 24 * samples.slant**5  # Schlick's, relative to its value 0.04 of a facing surface
     terms = _harmonics(samples.mirrored) * fresnel[:, None] * np.median(value)
     parts = [terms / np.maximum(value[3 * samples.point + c], least)[:, None] for c in range(3)]
-    return [sparse.csr_array(sparse.block_diag(parts))]
+    return sparse.csr_array(sparse.block_diag(parts))
 
 
 def _harmonics(direction: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 16"]:
