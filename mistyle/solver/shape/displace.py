@@ -139,7 +139,7 @@ def displace(
     reach = _reach(surface, rows)
     stiff = plate(surface) + sp.diags_array(HOLD * (1 + FAR_HOLD * reach**2) * mass_of(surface))
     basis = _basis(surface, reach < 1, normals if settings.along == "normal" else None)
-    while steps < settings.steps and rows.distance.any() and since < PATIENCE:
+    while basis.shape[1] and steps < settings.steps and rows.distance.any() and since < PATIENCE:
         smooth = max(settings.smooth, COARSE * FINER**steps)
         wanted = (basis @ _solved(rows, smooth**3 * stiff, basis, x)).reshape(-1, 3)
         length = np.linalg.norm(wanted, axis=1, keepdims=True)
@@ -212,6 +212,7 @@ def _basis(surface: WeldedSurface, movable: Bool[np.ndarray, " n"], normals: Flo
     if normals is None:
         rows = (3 * free[:, None] + np.arange(3)).reshape(-1)
         return sp.csc_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), (3 * count, len(rows)))
+    free = free[normals[free].any(axis=1)]
     rows, columns = (3 * free[:, None] + np.arange(3)).reshape(-1), np.repeat(np.arange(len(free)), 3)
     return sp.csc_array((normals[free].reshape(-1), (rows, columns)), (3 * count, len(free)))
 
