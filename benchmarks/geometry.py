@@ -100,7 +100,7 @@ def farthest(one: Mesh, other: Mesh, count: int = 60_000, near: int = 24) -> flo
     own = trimesh.Trimesh(one.positions, one.faces, process=False)
     points = np.concatenate([one.positions, np.asarray(trimesh.sample.sample_surface(own, count, seed=0)[0])])
     corners = other.positions[other.faces].astype(float)
-    index = KDTree(corners.mean(axis=1)).query(points, k=near)[1]
+    index = np.asarray(KDTree(corners.mean(axis=1)).query(points, k=near)[1])
     best = np.full(len(points), np.inf)
     for k in range(near):
         place = trimesh.triangles.closest_point(corners[index[:, k]], points.astype(float))

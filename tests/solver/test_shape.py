@@ -139,6 +139,18 @@ def test_boundaries_stay_and_seams_move_as_one():
     assert result.moved[1] > 0.05
 
 
+@pytest.mark.parametrize("along", ["any", "normal"])
+def test_a_mesh_of_boundaries_stays(along):
+    ball = sphere(2)
+    apart = ball.positions[ball.faces] * 0.99 + 0.01 * ball.positions[ball.faces].mean(axis=1, keepdims=True)
+    mesh = mesh_of(apart.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3))
+    camera = orbit(0, 0, distance=4, fov=30, size=(96, 96))
+    target = coverage(sphere(2, 1.0), camera)
+    outline = TargetOutline(camera, target, np.ones(target.shape, bool))
+    result = displace(mesh, [outline], DisplaceSettings(most=0.2, along=along))
+    assert result.positions.tobytes() == mesh.positions.tobytes()
+
+
 def test_a_step_that_folds_is_held_back():
     mesh = sphere(2)
     surface = surface_of(mesh)

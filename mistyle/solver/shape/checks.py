@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.geometry.intersections import self_intersections
 from mistyle.geometry.normals import area_vectors
-from mistyle.solver.shape.surface import Surface
+from mistyle.solver.shape.surface import WeldedSurface
 
 TRIES = 10  # halvings of a step around bad triangles; then their points stay
 SPREAD = 5  # tries after which the points beside the bad triangles shrink their steps, too
@@ -31,13 +31,13 @@ class CheckedStep:
     held: int
 
 
-def start_of(surface: Surface) -> Start:
+def start_of(surface: WeldedSurface) -> Start:
     """Area vectors and self-intersections of the surface as it is."""
     pairs = self_intersections(surface.points, surface.faces)
     return Start(area_vectors(surface.points, surface.faces), _keys(surface, pairs))
 
 
-def flipped(start: Start, surface: Surface, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " f"]:
+def flipped(start: Start, surface: WeldedSurface, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " f"]:
     """Triangles whose normal has turned by 90 degrees or more from the start, or that have collapsed. Triangles that
     were degenerate at the start do not count."""
     now = area_vectors(points, surface.faces)
@@ -47,7 +47,7 @@ def flipped(start: Start, surface: Surface, points: Float[np.ndarray, "n 3"]) ->
 
 
 def new_intersections(
-    start: Start, surface: Surface, points: Float[np.ndarray, "n 3"], moved: Bool[np.ndarray, " f"] | None = None
+    start: Start, surface: WeldedSurface, points: Float[np.ndarray, "n 3"], moved: Bool[np.ndarray, " f"] | None = None
 ) -> Int[np.ndarray, "k 2"]:
     """Intersecting pairs of faces that did not intersect at the start; with `moved`, only pairs with such a face."""
     pairs = self_intersections(points, surface.faces, moved)
@@ -55,7 +55,7 @@ def new_intersections(
 
 
 def checked_step(
-    start: Start, surface: Surface, x: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
+    start: Start, surface: WeldedSurface, x: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
 ) -> CheckedStep:
     """From the valid displacement `x` towards `target`: steps are halved around triangles that would be bad, and the
     last resort is to stay."""
@@ -76,5 +76,5 @@ def checked_step(
     return CheckedStep(x, int((target != x).any(axis=1).sum()))
 
 
-def _keys(surface: Surface, pairs: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, " k"]:
+def _keys(surface: WeldedSurface, pairs: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, " k"]:
     return pairs[:, 0] * len(surface.faces) + pairs[:, 1]

@@ -30,7 +30,7 @@ from mistyle.solver.shape.checks import checked_step, start_of
 from mistyle.solver.shape.outlines import Contour, Silhouette, contour_of, silhouette_of
 from mistyle.solver.shape.projective import silhouette_loss
 from mistyle.solver.shape.settings import DisplaceSettings
-from mistyle.solver.shape.surface import Surface, mass_of, normals_of, plate, surface_of
+from mistyle.solver.shape.surface import WeldedSurface, mass_of, normals_of, plate, surface_of
 
 AGREES = 0.25  # pixels: smaller distances of an outline are errors of its contour
 NEAR = 3  # pixels around a changed pixel in which the outline counts
@@ -139,7 +139,7 @@ def displace(
     reach = _reach(surface, rows)
     stiff = plate(surface) + sp.diags_array(HOLD * (1 + FAR_HOLD * reach**2) * mass_of(surface))
     basis = _basis(surface, reach < 1, normals if settings.along == "normal" else None)
-    while steps < settings.steps and rows.distance.any() and since < PATIENCE:
+    while basis.shape[1] and steps < settings.steps and rows.distance.any() and since < PATIENCE:
         smooth = max(settings.smooth, COARSE * FINER**steps)
         wanted = (basis @ _solved(rows, smooth**3 * stiff, basis, x)).reshape(-1, 3)
         length = np.linalg.norm(wanted, axis=1, keepdims=True)
@@ -170,13 +170,13 @@ def displace(
     )
 
 
-def _loss(surface: Surface, x: Float[np.ndarray, "n 3"], outlines: Sequence[TargetOutline]) -> float:
+def _loss(surface: WeldedSurface, x: Float[np.ndarray, "n 3"], outlines: Sequence[TargetOutline]) -> float:
     """The judge: mean squared difference of Mitsuba's silhouettes from the outlines."""
     cameras, coverages = [o.camera for o in outlines], [o.coverage for o in outlines]
     return silhouette_loss(surface.points + x, surface.faces, cameras, coverages)[0]
 
 
-def moved_positions(mesh: Mesh, surface: Surface, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 3"]:
+def moved_positions(mesh: Mesh, surface: WeldedSurface, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 3"]:
     """Positions of the mesh with displaced points; those of other points keep their bits."""
     points: Any = x.any(axis=1)
     moved = points[surface.of_vertex]
@@ -196,7 +196,7 @@ def _target(outline: TargetOutline) -> _Target | None:
     return _Target(outline.camera, contour, tree, counts, px, inside[band])
 
 
-def _reach(surface: Surface, rows: _Rows) -> Float[np.ndarray, " n"]:
+def _reach(surface: WeldedSurface, rows: _Rows) -> Float[np.ndarray, " n"]:
     """How far a point lies from every outline that must move: 0 up to NEARBY, 1 from ELSEWHERE on."""
     pulled = np.unique(rows.jacobian[rows.residual != 0].indices // 3)
     if not len(pulled):
@@ -205,13 +205,14 @@ def _reach(surface: Surface, rows: _Rows) -> Float[np.ndarray, " n"]:
     return np.clip((distance - NEARBY) / (ELSEWHERE - NEARBY), 0, 1)
 
 
-def _basis(surface: Surface, movable: Bool[np.ndarray, " n"], normals: Float[np.ndarray, "n 3"] | None) -> Any:
+def _basis(surface: WeldedSurface, movable: Bool[np.ndarray, " n"], normals: Float[np.ndarray, "n 3"] | None) -> Any:
     """The displacements that may vary, as columns: three of every free point, or one along its normal."""
     count = len(surface.points)
     free = np.flatnonzero(~surface.fixed & movable)
     if normals is None:
         rows = (3 * free[:, None] + np.arange(3)).reshape(-1)
         return sp.csc_array((np.ones(len(rows)), (rows, np.arange(len(rows)))), (3 * count, len(rows)))
+    free = free[normals[free].any(axis=1)]
     rows, columns = (3 * free[:, None] + np.arange(3)).reshape(-1), np.repeat(np.arange(len(free)), 3)
     return sp.csc_array((normals[free].reshape(-1), (rows, columns)), (3 * count, len(free)))
 
@@ -239,7 +240,7 @@ def _solved(rows: _Rows, stiff: Any, basis: Any, x: Float[np.ndarray, "n 3"]) ->
     return cg(lhs, rhs, basis.T @ x.reshape(-1), rtol=ACCURACY, maxiter=ROUNDS, M=around)[0]
 
 
-def _rows(mesh: Mesh, surface: Surface, x: Float[np.ndarray, "n 3"], targets: Sequence[_Target]) -> _Rows:
+def _rows(mesh: Mesh, surface: WeldedSurface, x: Float[np.ndarray, "n 3"], targets: Sequence[_Target]) -> _Rows:
     """The equations of all views at the displacement `x`."""
     points = surface.points + x
     traced = tracer(replace(mesh, positions=moved_positions(mesh, surface, x)))
@@ -293,7 +294,7 @@ def _pulled(seen: Silhouette, target: _Target) -> tuple[np.ndarray, ...]:
     column, row = np.floor(target.contour.points).astype(np.int64).T
     height, width = target.counts.shape
     chosen = np.flatnonzero(target.counts[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])
-    distance, nearest = KDTree(seen.place).query(target.contour.points[chosen])
+    distance, nearest = map(np.asarray, KDTree(seen.place).query(target.contour.points[chosen]))
     facing = (target.contour.normals[chosen] * seen.normal[nearest]).sum(axis=1) > -ALIKE
     far = (distance > 1) & facing
     chosen, nearest, distance = chosen[far], nearest[far], distance[far]

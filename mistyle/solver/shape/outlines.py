@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from mistyle.core.camera import Camera, px_by_cam, px_from_world
 from mistyle.core.image import bilinear, gaussian
 from mistyle.geometry.normals import area_vectors
-from mistyle.solver.shape.surface import Surface
+from mistyle.solver.shape.surface import WeldedSurface
 
 BLUR = 0.7  # pixels of smoothing before the contour: hard masks lose their stairs
 STEP = 1.0  # pixels between silhouette points
@@ -75,7 +75,7 @@ def contour_of(coverage: Float[np.ndarray, "h w"]) -> Contour:
 
 
 def silhouette_of(
-    surface: Surface, points: Float[np.ndarray, "n 3"], camera: Camera, empty: Callable[[np.ndarray], np.ndarray]
+    surface: WeldedSurface, points: Float[np.ndarray, "n 3"], camera: Camera, empty: Callable[[np.ndarray], np.ndarray]
 ) -> Silhouette:
     """The silhouette of the surface at `points`; `empty` tells at which pixels (x, y) the camera sees no surface."""
     facing = (area_vectors(points, surface.faces) * (camera.position - points[surface.faces[:, 0]])).sum(axis=1) > 0

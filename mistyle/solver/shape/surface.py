@@ -15,7 +15,7 @@ LEAST_COTANGENT, MOST_COTANGENT = 0.02, 5.0  # of an edge; slivers would otherwi
 
 
 @dataclass(frozen=True)
-class Surface:
+class WeldedSurface:
     """The welded mesh: vertices at one place are one point, so that seams move as one.
 
     of_vertex   point of every vertex of the mesh
@@ -32,7 +32,7 @@ class Surface:
     fixed: Bool[np.ndarray, " n"]
 
 
-def surface_of(mesh: Mesh) -> Surface:
+def surface_of(mesh: Mesh) -> WeldedSurface:
     """The welded surface of a mesh, in its order of points. Edges of more than two faces count once for every two."""
     of_vertex = same_points(mesh.positions)
     points = np.zeros((int(of_vertex.max(initial=-1)) + 1, 3))
@@ -53,10 +53,10 @@ def surface_of(mesh: Mesh) -> Surface:
     fixed = np.ones(len(points), bool)
     fixed[faces.reshape(-1)] = False
     fixed[corners[first[~paired]].reshape(-1)] = True
-    return Surface(points, faces, of_vertex, corners[first], beside, fixed)
+    return WeldedSurface(points, faces, of_vertex, corners[first], beside, fixed)
 
 
-def normals_of(surface: Surface, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def normals_of(surface: WeldedSurface, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Unit normals of the points, area-weighted means over their faces; zero where these cancel."""
     vectors = area_vectors(points, surface.faces)
     total = np.zeros_like(points)
@@ -67,7 +67,7 @@ def normals_of(surface: Surface, points: Float[np.ndarray, "n 3"]) -> Float[np.n
     return total / np.where(length > 0, length, 1)
 
 
-def plate(surface: Surface) -> Any:
+def plate(surface: WeldedSurface) -> Any:
     """The matrix S M^-1 S of the thin-plate energy of a displacement, n x n, sparse.
 
     S is the cotangent stiffness (Pinkall and Polthier 1993), M the lumped area: the energy is the integral of the
@@ -91,7 +91,7 @@ def plate(surface: Surface) -> Any:
     return (stiffness @ sp.diags_array(1 / mass_of(surface)) @ stiffness).tocsc()
 
 
-def mass_of(surface: Surface) -> Float[np.ndarray, " n"]:
+def mass_of(surface: WeldedSurface) -> Float[np.ndarray, " n"]:
     """A third of the area around every point, at least a thousandth of the mean."""
     area = np.linalg.norm(area_vectors(surface.points, surface.faces), axis=1)
     shares = np.repeat(area / 3, 3)

@@ -93,7 +93,7 @@ def sentences(asset: Asset, shape: Shape) -> list[str]:
         return [
             *notes,
             f"--displace: the outlines of {', '.join(shape.views)} differ, but no checked displacement came closer to "
-            "them; no vertex moved. The mesh may be too coarse there, or the bound too small.",
+            "them; no vertex moved. The mesh may be too coarse there, a boundary, or the bound too small.",
         ]
     most = shape.result.moved[1]
     before, after = shape.overlap
