@@ -16,6 +16,7 @@ from mistyle.jobs.settings import resolve as settings_of
 from mistyle.process import memory
 from mistyle.stylization.pipeline import budget as stylize_budget
 from mistyle.stylization.pipeline.job import FINISH, STAGES
+from mistyle.stylization.pipeline.plan import lit_seconds
 from mistyle.stylization.settings import Settings, resolve
 
 
@@ -131,3 +132,15 @@ def test_the_command_line_plans_and_refuses(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path / "out"), "--memory", "300M"]) == 2
     assert "--memory 0.3G: the job needs" in capsys.readouterr().err
     assert not (tmp_path / "out").exists(), "refused before anything is made"
+
+
+def test_the_solve_of_lit_views_is_counted(tmp_path):
+    """Diffusion's views show light: they are solved for, where their light is known and the settings ask for it."""
+    texels, lit = 1024**2, {"stylizer": "diffusion"}
+    solved = lit_seconds(job(**lit), texels)
+    assert solved > 10 > 0 == lit_seconds(job(), texels) == lit_seconds(job(**lit, fit={"solve": False}), texels)
+    assert lit_seconds(job(**lit, rig={"resolution": 1024}), texels) > solved
+    assert lit_seconds(job(**lit, rig={"kind": "turntable", "views": 8, "resolution": 512}), texels) < solved
+    # Texels that the views do not resolve are not solved for.
+    assert lit_seconds(job(**lit), 64 * texels) == pytest.approx(solved, rel=0.7)
+    assert lit_seconds(job(**lit, draw={"scene": tmp_path / "own.xml"}), texels) == 0

@@ -59,7 +59,7 @@ def plan(job: Job) -> dict[str, Any]:
     s = job.settings
     pixels = view_pixels(s)
     texels = extent.sets * s.atlas.size**2
-    solve = _solving(s, texels)
+    solve = lit_seconds(s, texels)
     # The solve of lit views replaces phase 1.
     steps = fit_steps(s) - (s.fit.iterations1 if solve else 0)
     crops = steps * s.fit.crops
@@ -142,7 +142,7 @@ def plan_bake(mesh: Path, views: Path, out: Path, settings: Settings, name: str)
     }
 
 
-def _solving(settings: Settings, texels: int) -> float:
+def lit_seconds(settings: Settings, texels: int) -> float:
     """Seconds of the solve of lit views, on texels as large as the views resolve (optimise/two_phase.py, shrinkage);
     0 where none are solved for."""
     from mistyle.core.light import has_soft
