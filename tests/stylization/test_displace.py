@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,7 +87,7 @@ def test_a_drawn_horn_grows_and_keeps_its_paint(horned):
     assert 0.1 < step.max() <= 0.4 + 1e-5  # 20 % of a radius of 2
     assert (step == 0).mean() > 0.3
     # An independent reader sees the same.
-    other = trimesh.load(out / "asset" / "ball.glb", force="mesh", process=False)
+    other: Any = trimesh.load(out / "asset" / "ball.glb", force="mesh", process=False)
     assert np.abs(np.sort(other.vertices[:, 0])[-1] - after.source.user_positions[:, 0].max()) < 1e-5
     albedo = read_picture(out / "asset" / "textures" / "ball_albedo.png").rgb
     assert (np.abs(albedo - np.array(HORN) / 255).max(axis=-1) < 0.1).sum() > 5
