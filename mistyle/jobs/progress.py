@@ -79,11 +79,15 @@ class Remaining:
     GROWTH = 1.25
 
     def __init__(self) -> None:
-        self._begin, self._last = (time.perf_counter(), 0.0), float("inf")
+        self._begin, self._last, self._end = (time.perf_counter(), 0.0), float("inf"), float("inf")
 
     def begin_at(self, done: float) -> None:
         """An earlier run did this share; it does not count as fast work."""
         self._begin = time.perf_counter(), done
+
+    def end_in(self, seconds: float) -> None:
+        """A time limit ends the stage in so many seconds."""
+        self._end = time.perf_counter() + seconds
 
     def __call__(self, done: float) -> float | None:
         """Seconds left, None without an estimate."""
@@ -91,7 +95,7 @@ class Remaining:
         if not first < done < 1:
             return None
         left = (time.perf_counter() - start) / (done - first) * (1 - done)
-        self._last = min(left, self.GROWTH * self._last)
+        self._last = min(left, self.GROWTH * self._last, max(self._end - time.perf_counter(), 0.0))
         return self._last
 
 
@@ -108,6 +112,10 @@ class StageReport:
         """A resumed stage begins with this share."""
         self._remaining.begin_at(done)
         self(done)
+
+    def end_in(self, seconds: float) -> None:
+        """A time limit ends the stage in so many seconds."""
+        self._remaining.end_in(seconds)
 
 
 @contextmanager

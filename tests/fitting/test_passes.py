@@ -104,6 +104,8 @@ def test_the_time_left_grows_by_a_quarter_at_most(monkeypatch):
     assert left[:2] == [pytest.approx(90), pytest.approx(80)]
     assert all(b <= 1.25 * a + 1e-9 for a, b in zip(left[:-1], left[1:], strict=True))
     assert left[-1] < 6
+    remaining.end_in(2)
+    assert remaining(0.99) == pytest.approx(2)
 
 
 def test_a_resumed_stage_counts_from_where_it_began(monkeypatch):

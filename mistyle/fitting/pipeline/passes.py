@@ -79,6 +79,7 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         lambda arrays: checkpoint.save(folder, arrays), checkpoint.load(folder, run.progress.note)
     )
     limits = Limits(s.passes, deadline, watch, report.begin_at)
+    report.end_in(deadline - time.monotonic())
     try:
         return recover(
             asset.mesh, texels, captures, bounded.recover, s.seed, report,
