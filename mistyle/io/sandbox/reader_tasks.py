@@ -113,7 +113,7 @@ def picture(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.ndar
 
 
 def exposure(path: Path) -> tuple[float, float, float]:
-    nothing = (float("nan"),) * 3
+    nothing = float("nan"), float("nan"), float("nan")
     return nothing if path.suffix.lower() == ".exr" else pictures.exposure_of_picture(path)
 
 
