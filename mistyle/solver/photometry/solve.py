@@ -9,8 +9,9 @@ Two estimates of exposures, balances and vignetting, both linear in the logarith
    light (lens flare, haze) does not change it. Patches count whose pattern is that of the other pictures.
 
 The veil is then a polynomial in each picture: the difference from the points' radiance at the exposures of 2. It is
-kept where it lowers the robust difference between pictures to LOWER of that of 1; otherwise 1 is the result. Nothing is
-corrected where 1 does not lower the difference to LOWER of what reflections alone leave.
+kept where it lowers the robust difference between pictures to LOWER of that of 1, and to BESIDE of what 1 leaves with
+its reflections; otherwise 1 is the result. Nothing is corrected where 1 does not lower the difference to LOWER of what
+reflections alone leave.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,6 +41,7 @@ DARK, BRIGHT = 0.01, 0.9  # linear values: weight 1/2 below, none above, where J
 PATTERN, SAMPLES = 0.8, 12  # least correlation of a patch with the other pictures, and its least number of points
 PATCHES = 8  # of each picture, for the estimate by contrasts
 CONTRAST_STEPS = 4
+BESIDE = 1.5  # a castle with flare has 1.1, a glossy avocado without any 2.3
 LOWER = 0.9
 HARMONICS = 16  # spherical harmonics up to the third order
 SHEEN = 8  # terms of `_sheen`
@@ -104,7 +106,8 @@ def solve_photometry(
     if full and not agree and (contrasts := _contrasts(samples, levels)) is not None:
         lifted = _veil(_thinned(samples, LEVELS), contrasts)
         spread = _residuals(samples, contrasts, lifted)[1]
-        if spread < LOWER * _residuals(samples, levels, veil)[1]:
+        # Reflections are additive light too; a gloss that they explain is not a veil.
+        if spread < min(BESIDE * after, LOWER * _residuals(samples, levels, veil)[1]):
             chosen, veil, after = contrasts, lifted, spread
     chosen = _with_exif(chosen, np.asarray(exif, float)) if len(exif) else chosen
     names, shapes = tuple(c.name for c in captures.cameras), tuple(c.size for c in captures.cameras)
