@@ -452,7 +452,7 @@ def test_what_is_no_capture_stays_refused(tmp_path):
     (tmp_path / "cameras.json").write_text('[{"id": 0, "img_name": "a", "width": 4, "height": 4}]')
     with pytest.raises(InputRefused, match="cameras.json"):
         read_shots(tmp_path / "cameras.json")
-    with pytest.raises(InputRefused, match="expected a folder with camera.json, transforms.json or a COLMAP"):
+    with pytest.raises(InputRefused, match="expected a folder with camera.json, transforms.json, a COLMAP model"):
         read_shots(tmp_path)
 
 
