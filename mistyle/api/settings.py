@@ -24,6 +24,7 @@ class StylizeSettings(TypedDict, total=False):
     sweep: Stage
     atlas: Stage
     bake: Stage
+    displace: Stage
     finish: Stage
     fit: Stage
     repair: Stage
@@ -48,6 +49,8 @@ class FitSettings(TypedDict, total=False):
     start: Literal["nothing", "own"]
     read: Stage
     references: Stage
+    photometry: Stage
+    light: Stage
     atlas: Stage
     recover: Stage
     report: Stage
