@@ -58,7 +58,7 @@ def test_the_figures_of_an_undone_phase_are_those_before_it(monkeypatch):
     figures = {"phase1.detail": (0.9, 0.4), "phase2.style": (5.0, 3.0)}
     fit = SimpleNamespace(figures=figures, kept={"phase1": False, "phase2": True})
     empty = SimpleNamespace(texels=(), maps=(), seen=(), mask=())
-    made = SimpleNamespace(fit=fit, atlas=empty, repaired=empty, baked=empty, light=None, finishing=None)
+    made = SimpleNamespace(fit=fit, atlas=empty, repaired=empty, baked=empty, light=None, finishing=None, reshaped=None)
     found = summary.figures(made)
     assert found["phase1.detail"] == 0.9 and found["phase2.style"] == 3.0
 

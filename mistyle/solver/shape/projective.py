@@ -54,7 +54,7 @@ def silhouette_loss(
     params.keep([key])
     total, slope = 0.0, np.zeros(points.size)
     for k, (camera, coverage) in enumerate(zip(cameras, coverages, strict=True)):
-        target = mi.TensorXf(1 - gaussian(np.asarray(coverage, np.float32), SMOOTHING).astype(np.float32))
+        target = mi.TensorXf(aligned(1 - gaussian(np.asarray(coverage, np.float32), SMOOTHING)))
         if gradient:
             dr.enable_grad(params[key])
             params.update()

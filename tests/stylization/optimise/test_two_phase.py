@@ -22,6 +22,7 @@ from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.stylization.inpaint.settings import RepairSettings
 from mistyle.stylization.optimise import lit_views as fit_lit
+from mistyle.stylization.optimise import settings as fit_settings
 from mistyle.stylization.optimise import two_phase as stages_fit
 from mistyle.stylization.optimise.lit_views import lit_phases
 from mistyle.stylization.optimise.settings import FitSettings
@@ -97,7 +98,7 @@ def test_lit_views_tell_relief_gloss_and_paint(scene, monkeypatch):
     """From the baked views, flat and half rough; the paper's own phases, from the same, stay where they were. With few
     steps, and no estimate of light between surfaces, of which a sphere has none."""
     for name, value in {"ITERATIONS": 32, "BOUNCES": 0}.items():
-        monkeypatch.setattr(fit_lit, name, value)
+        monkeypatch.setattr(fit_settings, name, value)
     light, mesh, texels = lights("phase1"), scene.asset.mesh, scene.atlas.texels
     views = views_of(scene, light)
     baked = known.baked(scene, views)
