@@ -35,7 +35,7 @@ CONVENTION = 0.1  # weight of the mean light's squared relative distance from th
 STEP = 0.01  # of finite differences by tilt, roughness and metallic
 BLOCK = 1024  # texels per batch
 TRIES, INNER = 5, 8  # damping values per step; iterations of the texel solver after it
-SETTLED = 2e-3  # relative decrease of the cost that counts as convergence
+SETTLED = 1e-3  # relative decrease of the cost that counts as convergence
 LEAST_CURVATURE = 1e-7  # added to the diagonal of the light's matrix, relative to its mean
 EXCHANGES = 3  # block exchanges without progress before single ones
 

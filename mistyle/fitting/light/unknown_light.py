@@ -35,7 +35,7 @@ from mistyle.solver.texels.observations import ObservationOptions, TexelObservat
 SIDE = 192  # pixels along the longer side of the small pictures
 ATLAS, LEAST = 96, 16  # texels a side of the coarse atlas: all sets together, and the least for each
 PICTURES = 48  # at most, evenly chosen
-OBSERVATIONS = 16_000  # target number of observations; the time is proportional to it
+OBSERVATIONS = 30_000  # target number of observations; the time is proportional to it
 STEPS = (10, 12)  # joint steps with even cells, and with finer ones
 NOISE, RELATIVE = 0.01, 0.03  # standard deviation of a small picture's pixels: the model is coarse
 FLOOR = 0.1  # least roughness; smaller values give highlights narrower than the finest cells
