@@ -48,8 +48,7 @@ def painted(mesh: Path, style: Path) -> tuple[Any, list[Any]]:
     asset = read_mesh(mesh)
     atlas = lay_out(asset, settings, lambda done: None)
     layers = painting.paint_layers(asset, read_picture(style), atlas, settings, lambda done: None)
-    flat = painting.painted(asset, layers, atlas, settings)
-    return asset, painting.raised(asset, layers, atlas, settings, flat)
+    return asset, painting.raised(asset, layers, atlas, settings)[1]
 
 
 def cropped(path: Path, width: int, height: int) -> np.ndarray:
