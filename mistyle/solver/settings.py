@@ -29,6 +29,10 @@ class RecoverSettings(BaseModel):
         default=False,
         description="fit metallic too, near 0 or 1 unless the data disagree; else the start's stays (0 if none)",
     )
+    black_gloss: Literal["metal", "plastic"] = Field(
+        default="metal",
+        description="with metallic: what black gloss is taken for where no picture shows its highlight",
+    )
     solver: Literal["both", "texels", "pictures"] = Field(
         default="both",
         description="per texel (Levenberg-Marquardt), then whole pictures (Adam), or one of them alone",

@@ -59,7 +59,7 @@ def recovered(maps: Maps) -> Recovered:
     cameras = [replace(c, name=f"{c.name}.{k}") for c in fibonacci(12, 80) for k in range(3)]
     lights = [(directional(*light),) for _ in range(12) for light in LIGHTS]
     pictures = photographs(mesh, [maps], cameras, lights, "mikkt", DIRECT)
-    settings = RecoverSettings(metallic=True, bounces=0, solver="texels")
+    settings = RecoverSettings(metallic=True, black_gloss="plastic", bounces=0, solver="texels")
     return recover(mesh, [rasterise(mesh, 0, SIZE)], in_memory(cameras, lights, pictures), settings, 0)
 
 

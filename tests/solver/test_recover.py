@@ -482,15 +482,16 @@ def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
     np.testing.assert_allclose(((x - around) ** 2 * weight).sum(axis=1) + constant, wanted, rtol=1e-4)
 
 
-def test_black_that_no_gloss_shows_on_is_rather_plastic_than_a_mirror():
-    """Black paint costs something where it is smooth and seen often, less than a metal, and nothing where its gloss
-    shows."""
+def test_black_that_no_gloss_shows_on_is_what_the_setting_says():
+    """Smooth black paint that is seen often costs more or less than a metal, and nothing where its gloss shows."""
     from mistyle.solver.prior import OFTEN, log_prior_penalty
 
     values = np.zeros((4, 7), np.float32)
     values[:, 5] = 0.1, 0.8, 0.1, 0.1
     values[2, 6], seen = 1, np.array([OFTEN, OFTEN, OFTEN, 1])
-    smooth, matt, metal, once = log_prior_penalty(values, seen)
+    smooth, matt, metal, once = log_prior_penalty(values, seen, "metal")
+    assert matt == 0 < once < metal < smooth
+    smooth, matt, metal, once = log_prior_penalty(values, seen, "plastic")
     assert matt == 0 < once < smooth < metal
 
 

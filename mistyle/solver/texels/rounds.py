@@ -86,7 +86,7 @@ def first_solve(
         done = lambda share, k=k: progress((k + share) / len(tries))  # noqa: E731
         arguments = each, around, weight, settings.solver_iterations, done
         solution = keep(f"start{k}", lambda given=arguments: problem.solve(*given))
-        extra = log_prior_penalty(solution.values, observed.seen) if settings.metallic else 0
+        extra = log_prior_penalty(solution.values, observed.seen, settings.black_gloss) if settings.metallic else 0
         solved.append((solution, penalty(solution.values, around, weight) + extra))
     return best_by_region(problem, solved, observed, atlas) if settings.metallic else best(solved)[0]
 
@@ -129,16 +129,16 @@ def another_round(
             own = np.where((_is_metal(solution.values) == metal)[:, None], solution.values, around[0])
             labels = np.full(len(own), metal, np.float32)
             keep = lambda name, solve, metal=metal: current.keep(f"{name}_class{metal:.0f}", solve)  # noqa: E731
-            candidates += _tries((problem, keep), own, around, labels, observed, True)
+            candidates += _tries((problem, keep, settings), own, around, labels, observed, True)
         return best_by_region(problem, candidates, observed, atlas)
     if settings.metallic:
         kept = _is_metal(solution.values)
     restart = current.since < RESTARTS and not settings.metallic
-    return best(_tries((problem, current.keep), solution.values, near, kept, observed, restart))[0]
+    return best(_tries((problem, current.keep, settings), solution.values, near, kept, observed, restart))[0]
 
 
 def _tries(
-    solver: tuple[Problem, Keep],
+    solver: tuple[Problem, Keep, RecoverSettings],
     own: Values,
     near: tuple[Values, Values],
     metal: Float[np.ndarray, " t"] | None,
@@ -157,13 +157,13 @@ def _tries(
             guess[:, ROUGHNESS] = roughness
         starts.append((guess, 8))
     around, weight, constant = (*near, 0) if metal is None else combine_class_prior(*near, metal)
-    problem, keep = solver
+    problem, keep, settings = solver
     solved = []
     for k, (start, steps) in enumerate(starts):
         solution = keep(f"try{k}", lambda begin=start, steps=steps: problem.solve(begin, around, weight, steps))
         extra = penalty(solution.values, around, weight) + constant
         if metal is not None:
-            extra = extra + log_prior_penalty(solution.values, observed.seen)
+            extra = extra + log_prior_penalty(solution.values, observed.seen, settings.black_gloss)
         solved.append((solution, extra))
     return solved
 
