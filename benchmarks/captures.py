@@ -20,11 +20,8 @@ trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out
 """
 
 import json
-import os
-import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks import recovery_pictures as drawing
-from benchmarks.common import finish, parser
+from benchmarks.common import finish, parser, run_mistyle
 from benchmarks.material_metrics import align_channels, map_errors, orb_mask, psnr_ldr
 from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, seen, truth
 from mistyle.atlas.texels import rasterise
@@ -58,7 +55,6 @@ from mistyle.solver.photometry.solve import solve_photometry
 from mistyle.solver.texels.gbuffer import open_sky
 from mistyle.solver.texels.observations import ObservationOptions, collect_observations
 
-PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"
 QUICK = ["--atlas", 256, "--set", "recover.solver=texels", "--set", "recover.bounces=0"]
 STEP = 3  # texels between the two of a pair
 PHONES, SKY = ("suzanne", "avocado"), "kiara_1_dawn_1k.hdr"
@@ -98,9 +94,9 @@ def castle(out: Path, quick: bool) -> dict[str, float]:
     folder = data_folder() / "photographs" / "castle"
     words = ["fit", folder / "scene_mesh.ply", folder, "-o", out, "--align", "--light", "unknown", "--hold-out", 2]
     words += ["--preset", "draft", *(QUICK if quick else [])]
-    plan = _mistyle(*words, "--dry-run")
+    plan = run_mistyle(*words, "--dry-run")
     start = time.perf_counter()
-    summary = _mistyle(*words)
+    summary = run_mistyle(*words)
     figures = {"castle.seconds": time.perf_counter() - start}
     figures["castle.plan_ratio"] = figures["castle.seconds"] / plan["seconds"]
     run = castle_run(folder, out)
@@ -246,7 +242,7 @@ def _phone(name: str, place: Path, side: int, quick: bool) -> dict[str, float]:
     words = ["fit", file, place / "shots", "-o", place / "out", "--masks", place / "shots" / "masks"]
     words += ["--light", "unknown", "--preset", "draft", *(QUICK if quick else []), "--atlas", size]
     start = time.perf_counter()
-    _mistyle(*words)
+    run_mistyle(*words)
     result = {"seconds": time.perf_counter() - start}
     work = place / "out" / "work"
     found, recovered = load_record(work / "photometry" / "record"), load_record(work / "recover" / "record")
@@ -293,14 +289,6 @@ def relit(known: Truth, maps: Any, side: int, quick: bool) -> float:
             mask = orb_mask(a[..., 3])
             errors.append(psnr_ldr(a[..., :3], align_channels(a[..., :3], b[..., :3], mask), mask))
     return float(np.mean(errors))
-
-
-def _mistyle(*words: Any) -> Mapping[str, Any]:
-    command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ)
-    if done.returncode != 0:
-        raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}")
-    return json.loads(done.stdout)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import platform
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 from mistyle.process.cores import cores
 
 T = TypeVar("T")
+PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"  # `python -c` of it is the command line
 
 
 def arguments(description: str, argv: list[str] | None = None) -> argparse.Namespace:
@@ -37,6 +39,15 @@ def timed(figures: dict[str, float], name: str, work: Callable[[], T]) -> T:
     figures[name] = time.perf_counter() - wall
     figures[f"{name}.cpu"] = time.process_time() - cpu
     return result
+
+
+def run_mistyle(*words: Any) -> Any:
+    """The JSON that `mistyle WORDS --json` prints; SystemExit where it fails."""
+    command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ)
+    if done.returncode != 0:
+        raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}")
+    return json.loads(done.stdout)
 
 
 def peak_gb() -> float:

@@ -15,8 +15,6 @@ megapixels.
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,7 +27,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks import recovery_pictures as drawing
-from benchmarks.common import finish
+from benchmarks.common import finish, run_mistyle
 from benchmarks.material_metrics import map_errors
 from benchmarks.recovery_truth import data_folder, find_asset, truth
 from mistyle.atlas.texels import rasterise, start_maps
@@ -54,7 +52,6 @@ from mistyle.solver.validate import downsampling_factors
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024
 FINEST = 4
-PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"
 
 
 def main() -> None:
@@ -88,7 +85,7 @@ def large(place: Path, views: int, side: int) -> dict[str, float]:
         figures[f"{name}.predict_seconds"] = _prediction(asset.mesh, held)
     words = ["fit", mesh, folder, "-o", place / "run", "--set", "references.saturation=0.99", "--atlas", ATLAS]
     start = time.perf_counter()
-    made = _mistyle(*words)
+    made = run_mistyle(*words)
     figures |= {"large.seconds": time.perf_counter() - start, "large.peak_gb": made["peak_gb"]}
     told = json.loads((place / "run" / "run.json").read_text())
     settings = MaterialSettings.model_validate(told["settings"])
@@ -199,14 +196,6 @@ def _seconds(work) -> float:
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
-
-
-def _mistyle(*words) -> dict:
-    command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ)
-    if done.returncode != 0:
-        raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}")
-    return json.loads(done.stdout)
 
 
 if __name__ == "__main__":

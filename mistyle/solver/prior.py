@@ -17,7 +17,7 @@ METAL_SPREAD = 0.1  # standard deviation of metallic about 0 or 1: few surfaces 
 METAL_ALBEDO, METAL_ALBEDOS = 0.6, 0.2
 METAL_COST = 8.0  # -2 log of the prior odds of a metal
 # Cost of a black dielectric by what black gloss is taken for, the albedo from which it is zero, and the observations at
-# which it is full. Of DamagedHelmet's texels 24 to 28 % had the wrong class with 4 to 8, and 13 % with 10.
+# which it is full. With 4, DamagedHelmet's metals become plastic.
 BLACK_COST = {"metal": 10.0, "plastic": 4.0}
 PALEST_BLACK, OFTEN = 0.02, 8
 # Roughness range over which a highlight becomes visible, so that the texel cannot be a mirror instead.
