@@ -31,7 +31,7 @@ class Seed:
 
 def seeds() -> list[Seed]:
     """Every format once or more."""
-    return [*_meshes(), *_usd(), *_pictures(), *_cameras(), *_colmap(), *_settings(), *_arrays()]
+    return [*_meshes(), *_usd(), *_pictures(), *_cameras(), *_colmap(), *_photogrammetry(), *_settings(), *_arrays()]
 
 
 # --- the files ---
@@ -283,6 +283,31 @@ def _colmap() -> list[Seed]:
     return [
         Seed("colmap", "colmap", {"cameras.bin": camera, "images.bin": image, "points3D.bin": point}, "."),
         Seed("colmap text", "colmap", text, "."),
+    ]
+
+
+def _photogrammetry() -> list[Seed]:
+    """Cameras of Meshroom and of Metashape, with their picture."""
+    pose = "1 0 0 0 0 1 0 0 0 0 1 -4 0 0 0 1"
+    size, lens = '<resolution width="16" height="12"/>', "<f>20</f><cx>0.5</cx><cy>0</cy><k1>0.1</k1><p1>0.01</p1>"
+    agisoft = (
+        f'<document version="2.0.0"><chunk><sensors><sensor id="0" type="frame">{size}<calibration type="frame" '
+        f'class="adjusted">{size}{lens}</calibration></sensor></sensors><components><component id="0"><transform>'
+        "<rotation>1 0 0 0 1 0 0 0 1</rotation><translation>0 0 0</translation><scale>2</scale></transform></component>"
+        '</components><cameras><camera id="0" sensor_id="0" component_id="0" label="a"><transform>'
+        f"{pose}</transform></camera></cameras></chunk></document>"
+    )
+    transform = {"rotation": ["1", "0", "0", "0", "1", "0", "0", "0", "1"], "center": ["0", "0", "-4"]}
+    sfm = {
+        "version": ["1", "2", "6"],
+        "views": [{"viewId": "1", "poseId": "1", "intrinsicId": "1", "path": "a.png"}],
+        "intrinsics": [{"intrinsicId": "1", "width": "16", "height": "12", "type": "pinhole", "sensorWidth": "36",
+                        "focalLength": "45", "principalPoint": ["0", "0"]}],
+        "poses": [{"poseId": "1", "pose": {"transform": transform}}],
+    }  # fmt: skip
+    return [
+        Seed("metashape", "captures", {"cameras.xml": agisoft.encode(), "a.png": png()}, "."),
+        Seed("meshroom", "captures", {"cameras.sfm": json.dumps(sfm).encode(), "a.png": png()}, "."),
     ]
 
 

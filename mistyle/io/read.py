@@ -29,6 +29,7 @@ __all__ = [
     "read_frame",
     "read_hdr",
     "read_json",
+    "read_metashape",
     "read_npy",
     "read_picture",
     "read_radiance",
@@ -124,6 +125,11 @@ def read_colmap(folder: Path) -> list[Any]:
     `read_model`.
     """
     return ask("colmap_model", Path(folder))
+
+
+def read_metashape(path: Path) -> list[Any]:
+    """The aligned cameras of Metashape's XML as Frames; see io/cameras/metashape.py `read_cameras`."""
+    return ask("metashape", Path(path))
 
 
 def read_colmap_points(folder: Path) -> Any:

@@ -1,10 +1,11 @@
 """Reader of a fit's references: photographs or renders with known cameras.
 
 A folder with our `camera.json` (io/cameras/camera_files.py), a NeRF/Blender `transforms.json` with its pictures, a
-COLMAP model with its `images`, or Meshroom's `cameras.sfm` (io/cameras/sfm.py). EXR pictures are linear and, where they
-have an A channel, premultiplied by it; all others are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture
-becomes linear Rec.709 radiance seen by a pinhole camera with square pixels: encoded values go through the exact sRGB
-curve, lens distortion and unequal focal lengths are removed by resampling.
+COLMAP model with its `images`, Meshroom's `cameras.sfm` (io/cameras/sfm.py), or Metashape's XML of cameras
+(io/cameras/metashape.py). EXR pictures are linear and, where they have an A channel, premultiplied by it; all others
+are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture becomes linear Rec.709 radiance seen by a pinhole
+camera with square pixels: encoded values go through the exact sRGB curve, lens distortion and unequal focal lengths are
+removed by resampling.
 
 A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py):
 `CapturedPicture.pixels`, for both the picture and the mask of a view.
@@ -53,14 +54,18 @@ from mistyle.io.read import (
     read_colmap_points,
     read_exr,
     read_json,
+    read_metashape,
     read_picture,
     read_radiance,
     read_size,
     read_stored_size,
 )
-from mistyle.io.sandbox.bounds import inside, refuse
+from mistyle.io.sandbox.bounds import inside, read_bytes, refuse
 
-EXPECTED = "a folder with camera.json, transforms.json, a COLMAP model (sparse/0) or cameras.sfm, or one of these files"
+EXPECTED = (
+    "a folder with camera.json, transforms.json, a COLMAP model (sparse/0), Meshroom's cameras.sfm or Metashape's XML, "
+    "or one of these files"
+)
 KEPT = 2  # pictures held decoded
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 
@@ -139,21 +144,19 @@ def read_shots(
     if kind == "camera.json":
         shots = [_own(file, camera, entry, elsewhere) for camera, entry in read_entries(file)]
     else:
-        folder = images_folder(Path(path), file) if kind == "colmap" and elsewhere is None else file.parent
+        folder = _pictures_folder(kind, Path(path), file) if elsewhere is None else elsewhere
 
         def place(name: str) -> Path:
             if elsewhere is None and kind != "sfm":
                 return find(folder, name, file)
             # Meshroom names pictures by where they lay on the machine of the reconstruction.
-            return find_elsewhere(elsewhere or folder, name)
+            return find_elsewhere(folder, name)
 
         def size(name: str) -> tuple[int, int]:
             return read_size(place(name), "stored")
 
-        if kind == "colmap":
-            frames = read_colmap(file)
-        else:
-            frames = read_sfm(file) if kind == "sfm" else read_frames(file, size)
+        readers = {"colmap": read_colmap, "sfm": read_sfm, "metashape": read_metashape}
+        frames = readers[kind](file) if kind in readers else read_frames(file, size)
         # The user's masks replace those that frames name.
         homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
         named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
@@ -275,12 +278,14 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
     return tuple(notes)
 
 
-def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm"], Path]:
+def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm", "metashape"], Path]:
     """The kind of references at `path`, and the file (COLMAP: the model's folder) with the cameras."""
     if path.is_dir():
         camera_files = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
         camera_files += sorted(path.glob("*.sfm"))
         model = find_model(path)
+        if model is None:  # it has points beside the cameras
+            camera_files += [file for file in sorted(path.glob("*.xml")) if _is_metashape(file)]
         if not camera_files and model is not None:
             return "colmap", model
         if not camera_files:
@@ -288,10 +293,26 @@ def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", 
         path = camera_files[0]
     elif not path.is_file():
         raise refuse(path, "nothing", EXPECTED, "Check the path")
+    if path.suffix.lower() == ".xml" and _is_metashape(path):
+        return "metashape", path
     if path.suffix.lower() not in (".json", ".sfm"):
         raise refuse(path, f"a file ending in '{path.suffix}'", EXPECTED, "Hand in the folder with the cameras")
     tree = read_json(path)
     return ("sfm" if is_sfm(tree) else "transforms" if "frames" in tree else "camera.json"), path
+
+
+def _pictures_folder(kind: str, path: Path, file: Path) -> Path:
+    """The folder of the pictures of references at `path`, whose cameras are in `file`."""
+    if kind == "colmap":
+        return images_folder(path, file)
+    below = file.parent / "images"
+    return below if kind == "metashape" and below.is_dir() else file.parent
+
+
+def _is_metashape(path: Path) -> bool:
+    """Whether an XML file is one of Metashape's cameras (io/cameras/metashape.py)."""
+    head = read_bytes(path, count=4096)
+    return b"<document" in head and b"<chunk" in head
 
 
 def _home(path: Path) -> Path:

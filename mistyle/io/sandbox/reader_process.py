@@ -43,6 +43,7 @@ BOUNDED = (
     "gltf.schema",
     "gltf.check",
     "cameras.colmap",
+    "cameras.metashape",
     "cameras.camera_files",
 )
 PIPE_BYTES = 1 << 20

@@ -216,6 +216,12 @@ def colmap_points(folder: Path) -> Any:
     return read_points(folder)
 
 
+def metashape(path: Path) -> list[Any]:
+    from mistyle.io.cameras.metashape import read_cameras
+
+    return read_cameras(path)
+
+
 def usd_files(path: Path) -> list[str]:
     from mistyle.io.usd.read import files_of
 
@@ -253,4 +259,5 @@ TASKS: dict[str, Callable[..., Any]] = {
     "yaml": yaml,
     "colmap_model": colmap_model,
     "colmap_points": colmap_points,
+    "metashape": metashape,
 }
