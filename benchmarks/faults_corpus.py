@@ -305,10 +305,48 @@ def _photogrammetry() -> list[Seed]:
                         "focalLength": "45", "principalPoint": ["0", "0"]}],
         "poses": [{"poseId": "1", "pose": {"transform": transform}}],
     }  # fmt: skip
+    # LibRaw refuses files of a few pixels.
+    larger = agisoft.replace(size, '<resolution width="32" height="24"/>')
     return [
         Seed("metashape", "captures", {"cameras.xml": agisoft.encode(), "a.png": png()}, "."),
+        Seed("raw", "captures", {"cameras.xml": larger.encode(), "a.dng": dng(np.full((24, 32, 3), 30000))}, "."),
         Seed("meshroom", "captures", {"cameras.sfm": json.dumps(sfm).encode(), "a.png": png()}, "."),
     ]
+
+
+def dng(values: np.ndarray, orientation: int = 1) -> bytes:
+    """A DNG of linear Rec.709 values (h w 3, uint16) behind a Bayer filter RGGB, as a sensor of sRGB's primaries.
+
+    Tags are those of TIFF 6.0, TIFF/EP and DNG 1.4, little-endian.
+    """
+    height, width, _ = values.shape
+    mosaic = np.empty((height, width), "<u2")
+    for k, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        mosaic[row::2, column::2] = values[row::2, column::2, (0, 1, 1, 2)[k]]
+    rgb_from_xyz = (3.2405, -1.5371, -0.4985, -0.9693, 1.8760, 0.0416, 0.0556, -0.2040, 1.0572)
+    short, long, byte, text = "H", "I", "B", "s"  # struct's letters of TIFF types
+    tags: dict[int, tuple[int, str, list]] = {
+        254: (4, long, [0]), 256: (4, long, [width]), 257: (4, long, [height]), 258: (3, short, [16]),
+        259: (3, short, [1]), 262: (3, short, [32803]), 271: (2, text, [b"mistyle\0"]), 272: (2, text, [b"test\0"]),
+        273: (4, long, [0]), 274: (3, short, [orientation]), 277: (3, short, [1]), 278: (4, long, [height]),
+        279: (4, long, [mosaic.nbytes]), 33421: (3, short, [2, 2]), 33422: (1, byte, [0, 1, 1, 2]),
+        50706: (1, byte, [1, 4, 0, 0]), 50708: (2, text, [b"mistyle test\0"]), 50714: (3, short, [0]),
+        50717: (3, short, [65535]), 50721: (10, "i", [n for v in rgb_from_xyz for n in (round(v * 10000), 10000)]),
+        50728: (5, long, [1, 1, 1, 1, 1, 1]), 50778: (3, short, [21]),
+    }  # fmt: skip
+    start = 8 + 2 + 12 * len(tags) + 4
+    directory, beyond = struct.pack("<H", len(tags)), b""
+    sizes = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 10: 8}
+    raw = {tag: items[0] if kind == text else struct.pack(f"<{len(items)}{kind}", *items)
+           for tag, (_, kind, items) in tags.items()}  # fmt: skip
+    longer = sum(len(data) + len(data) % 2 for data in raw.values() if len(data) > 4)
+    raw[273] = struct.pack("<I", start + longer)
+    for tag, (number, _, _) in tags.items():
+        data = raw[tag]
+        held = data.ljust(4, b"\0") if len(data) <= 4 else struct.pack("<I", start + len(beyond))
+        beyond += data.ljust(len(data) + len(data) % 2, b"\0") if len(data) > 4 else b""
+        directory += struct.pack("<HHI", tag, number, len(data) // sizes[number]) + held
+    return b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", 0) + beyond + mosaic.tobytes()
 
 
 def _settings() -> list[Seed]:

@@ -21,6 +21,8 @@ from mistyle.core.mesh import Mesh
 TURNED = "turned from Z up to Y up"  # part of the note of every mesh that reading has turned
 # Rows and columns as the file stores them, or as a viewer shows the picture (EXIF orientation).
 Pixels = Literal["stored", "upright"]
+# Endings of cameras' RAW files.
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
 
 @dataclass(frozen=True)

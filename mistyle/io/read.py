@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt16
 
 from mistyle.core.asset import Picture, Pixels
 from mistyle.io.images.layers import LayeredPicture, frame_of
@@ -33,6 +33,7 @@ __all__ = [
     "read_npy",
     "read_picture",
     "read_radiance",
+    "read_raw",
     "read_size",
     "read_stored_size",
     "read_toml",
@@ -105,6 +106,11 @@ def read_picture(path: Path, pixels: Pixels = "upright") -> Picture:
 def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
     """An environment map: linear Rec.709 radiance >= 0 of an .exr (its R, G, B) or .hdr, row 0 at the top."""
     return ask("radiance", Path(path))
+
+
+def read_raw(path: Path, pixels: Pixels = "stored") -> UInt16[np.ndarray, "h w 3"]:
+    """A camera's RAW file (endings `core.asset.RAW`) as linear Rec.709, developed as io/images/raw.py describes."""
+    return ask("raw", Path(path), pixels)
 
 
 def read_size(path: Path, pixels: Pixels = "upright") -> tuple[int, int]:

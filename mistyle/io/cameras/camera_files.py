@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mistyle.core.asset import Pixels
+from mistyle.core.asset import RAW, Pixels
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera
 from mistyle.core.errors import InputRefused
 from mistyle.geometry.lens import Lens, is_distorted
@@ -45,7 +45,7 @@ PIXELS: Pixels = "upright"  # that a camera.json describes
 MAX_SIDE = 16384
 # Tolerance of stored rotations: files with five digits pass.
 RIGID = 1e-4
-ENDINGS = (".exr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+ENDINGS = (".exr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", *RAW)
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]

@@ -2,10 +2,10 @@
 
 A folder with our `camera.json` (io/cameras/camera_files.py), a NeRF/Blender `transforms.json` with its pictures, a
 COLMAP model with its `images`, Meshroom's `cameras.sfm` (io/cameras/sfm.py), or Metashape's XML of cameras
-(io/cameras/metashape.py). EXR pictures are linear and, where they have an A channel, premultiplied by it; all others
-are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture becomes linear Rec.709 radiance seen by a pinhole
-camera with square pixels: encoded values go through the exact sRGB curve, lens distortion and unequal focal lengths are
-removed by resampling.
+(io/cameras/metashape.py). EXR pictures are linear and, where they have an A channel, premultiplied by it; cameras' RAW
+files are developed linearly (io/images/raw.py); all others are sRGB-encoded with straight alpha, 8 or 16 bits. Every
+picture becomes linear Rec.709 radiance seen by a pinhole camera with square pixels: encoded values go through the exact
+sRGB curve, lens distortion and unequal focal lengths are removed by resampling.
 
 A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py):
 `CapturedPicture.pixels`, for both the picture and the mask of a view.
@@ -27,7 +27,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.asset import Picture, Pixels
+from mistyle.core.asset import RAW, Picture, Pixels
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.errors import InputRefused
@@ -57,6 +57,7 @@ from mistyle.io.read import (
     read_metashape,
     read_picture,
     read_radiance,
+    read_raw,
     read_size,
     read_stored_size,
 )
@@ -185,6 +186,9 @@ def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ..
         notes.append(
             f"Files with an EXIF orientation: {tagged[0]} pictures, {tagged[1]} masks (of {len(shots)} views). {done}"
         )
+    raw = sum(shot.picture.suffix.lower() in RAW for shot in shots)
+    if raw:
+        notes.append(f"{raw} RAW pictures were developed linearly, with the white balance of daylight.")
     unused = _home(Path(path)) / "masks"
     if unused.is_dir() and not any(shot.mask for shot in shots):
         notes.append(f"The folder {unused} was not used; --masks {unused} hands it in.")
@@ -408,6 +412,10 @@ def _decoded(
             raise refuse(shot.picture, found, "R, G and B", "Write the colours as R, G, B")
         rgb = np.stack([planes[c] for c in "RGB"], axis=-1)
         return rgb, planes.get("A"), np.asarray(np.isfinite(rgb).all(axis=-1))
+    if shot.picture.suffix.lower() in RAW:
+        values = read_raw(shot.picture, shot.pixels)
+        usable = np.asarray((values < 65535 * min(saturation, 1)).all(axis=-1))
+        return values.astype(np.float32) / 65535, _alpha(shot), usable
     picture = read_picture(shot.picture, shot.pixels)
     alpha = _alpha(shot, picture)
     return linear_from_srgb(picture.rgb), alpha, np.asarray((picture.rgb < saturation).all(axis=-1))
@@ -417,10 +425,11 @@ def _alpha(shot: CapturedPicture, decoded: Picture | None = None) -> Float[np.nd
     """The alpha of the picture (`decoded`, if available), or of the EXR that it replaces."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")
-    picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded
-    if picture.alpha is not None or shot.alpha_of is None:
-        return picture.alpha
-    return read_exr(shot.alpha_of).get("A")
+    if shot.picture.suffix.lower() not in RAW:
+        picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded
+        if picture.alpha is not None:
+            return picture.alpha
+    return None if shot.alpha_of is None else read_exr(shot.alpha_of).get("A")
 
 
 def _inside(mask: Path, pixels: Pixels) -> Bool[np.ndarray, "h w"]:

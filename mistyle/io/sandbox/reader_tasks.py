@@ -17,7 +17,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.asset import Pixels
+from mistyle.core.asset import RAW, Pixels
 from mistyle.core.errors import InputRefused
 from mistyle.io.gltf.check import load_gltf, read_json
 from mistyle.io.gltf.glb import Buffers
@@ -112,15 +112,26 @@ def picture(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.ndar
     return pictures.read_pixels(path, pixels)
 
 
+def raw(path: Path, pixels: Pixels) -> np.ndarray:
+    from mistyle.io.images.raw import read_raw
+
+    return read_raw(path, pixels)
+
+
 def exposure(path: Path) -> tuple[float, float, float]:
     nothing = float("nan"), float("nan"), float("nan")
-    return nothing if path.suffix.lower() == ".exr" else pictures.exposure_of_picture(path)
+    return nothing if path.suffix.lower() in (".exr", *RAW) else pictures.exposure_of_picture(path)
 
 
 def size(path: Path) -> tuple[int, int, int]:
     if not path.is_file():
         raise refuse(path, "nothing", "a picture", "Check the path")
-    return (*hdr.size_of_exr(path), 1) if path.suffix.lower() == ".exr" else pictures.size_of_picture(path)
+    kind = path.suffix.lower()
+    if kind in RAW:
+        from mistyle.io.images.raw import size_of_raw
+
+        return size_of_raw(path)
+    return (*hdr.size_of_exr(path), 1) if kind == ".exr" else pictures.size_of_picture(path)
 
 
 def npy(path: Path) -> np.ndarray:
@@ -247,6 +258,7 @@ TASKS: dict[str, Callable[..., Any]] = {
     "hdr": hdr.read_hdr,
     "radiance": radiance,
     "picture": picture,
+    "raw": raw,
     "shrink": shrink,
     "exposure": exposure,
     "size": size,
