@@ -1,4 +1,4 @@
-"""Photographs as they come: `python -m benchmarks.captures [--quick] [--json FILE] [--only castle|phone] [--keep DIR]`
+"""Photographs as they come: `python -m benchmarks.captures [--quick] [--json FILE] [--only PART] [--keep DIR]`
 
 `castle`: eleven JPEGs of a façade (MISTYLE_DATA/photographs/castle) with a COLMAP model, a mesh in another frame, sky,
 trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out 2 --preset draft`:
@@ -16,7 +16,12 @@ trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out
 (±10 %) and a vignetting of 30 %: `phone.relight_psnr_l`, `phone.albedo_psnr_scaled` (factor per channel),
 `phone.exposure_error` (largest error of a gain, relative), `phone.seconds`; means over the assets, the worst exposure.
 
---quick fits textures of 256², texel by texel alone; the phone's pictures have 160 pixels a side.
+`metals`: DamagedHelmet and WaterBottle with their own maps, 16 views of 256² x an environment in three positions, as
+`benchmarks.material_recovery --maps own_soft` draws and fits them; of both the worse: `metals.metallic_right` (share of
+the surface that three cameras see), `metals.albedo_psnr` and `calibration.worst` (from 0.683, over all maps).
+
+--quick fits textures of 256², texel by texel alone; the phone's pictures have 160 pixels a side,
+the metals' 96.
 """
 
 import json
@@ -31,6 +36,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks import material_recovery as recovery
 from benchmarks import recovery_pictures as drawing
 from benchmarks.common import finish, parser, run_mistyle
 from benchmarks.material_metrics import align_channels, map_errors, orb_mask, psnr_ldr
@@ -76,7 +82,9 @@ class CastleRun:
 
 def main() -> None:
     options = parser(__doc__ or "")
-    options.add_argument("--only", choices=("castle", "phone"), action="append", help="only this part (repeatable)")
+    options.add_argument(
+        "--only", choices=("castle", "phone", "metals"), action="append", help="only this part (repeatable)"
+    )
     options.add_argument("--keep", type=Path, help="folder for the runs, to look at afterwards")
     chosen = options.parse_args()
     figures: dict[str, float] = {}
@@ -86,6 +94,8 @@ def main() -> None:
             figures |= castle(place / "castle", chosen.quick)
         if "phone" in (chosen.only or ["phone"]):
             figures |= phone(place / "phone", chosen.quick)
+        if "metals" in (chosen.only or ["metals"]):
+            figures |= metals(place / "metals", chosen.quick)
     finish(figures, chosen.json)
 
 
@@ -227,6 +237,24 @@ def phone(place: Path, quick: bool) -> dict[str, float]:
     for name, row in zip(PHONES, rows, strict=True):
         print(name, {key: round(value, 3) for key, value in row.items()}, file=sys.stderr, flush=True)
     return figures
+
+
+def metals(place: Path, quick: bool) -> dict[str, float]:
+    """The worse of two assets with metal and dark gloss, lit by an environment."""
+    side, spp = (96, 32) if quick else (256, 128)
+    words = ["--assets", "damagedhelmet", "waterbottle", "--maps", "own_soft", "--out", place]
+    options = recovery.parse([str(word) for word in (*words, "--resolution", side, "--spp", spp)])
+    figures, rows = {}, []
+    for row in recovery.rows(options):
+        methods, _ = recovery.measure(row, options)
+        rows.append(methods["ours"])
+        for name in ("metallic_right", "albedo_psnr", "metallic_mse", "relight_psnr_l", "calibration_worst"):
+            figures[f"metals.{row.name}.{name}"] = methods["ours"][name]
+            if name in methods["constant"]:
+                figures[f"metals.{row.name}.constant.{name}"] = methods["constant"][name]
+    for name in ("metallic_right", "albedo_psnr"):
+        figures[f"metals.{name}"] = min(row[name] for row in rows)
+    return figures | {"calibration.worst": max(row["calibration_worst"] for row in rows)}
 
 
 def _phone(name: str, place: Path, side: int, quick: bool) -> dict[str, float]:

@@ -30,6 +30,7 @@ class MapErrors:
     roughness_mse        mean squared error of perceptual roughness
     roughness_median     median absolute error
     metallic_mse         mean squared error
+    metallic_right       share on the true side of 0.5
     normal_*_deg         angle between tangent-space normals, degrees: mean, median, 95th percentile
     """
 
@@ -38,6 +39,7 @@ class MapErrors:
     roughness_mse: float
     roughness_median: float
     metallic_mse: float
+    metallic_right: float
     normal_mean_deg: float
     normal_median_deg: float
     normal_p95_deg: float
@@ -141,6 +143,7 @@ def map_errors(truth: Sequence[Maps], fitted: Sequence[Maps], weights: Sequence[
         roughness_mse=_mean_square(*roughness, w),
         roughness_median=quantile(np.abs(roughness[0] - roughness[1])[:, 0], w, 0.5),
         metallic_mse=_mean_square(*metallic, w),
+        metallic_right=_share_alike(*metallic, w),
         normal_mean_deg=float((angle * w).sum() / w.sum()) if len(w) else float("nan"),
         normal_median_deg=quantile(angle, w, 0.5),
         normal_p95_deg=quantile(angle, w, 0.95),
@@ -180,6 +183,12 @@ def _mean_square(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> float:
     if len(weights) == 0:
         return float("nan")
     return float((((a - b) ** 2).mean(axis=1) * weights).sum() / weights.sum())
+
+
+def _share_alike(a: np.ndarray, b: np.ndarray, weights: np.ndarray) -> float:
+    """Share of the weight where both are on one side of 0.5."""
+    alike = ((a > 0.5) == (b > 0.5)).ravel()
+    return float((alike * weights).sum() / weights.sum()) if weights.any() else float("nan")
 
 
 def _decibels(mean_square: float) -> float:

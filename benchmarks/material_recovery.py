@@ -5,11 +5,11 @@
 Every object stands twice: with its own maps, and ("_strong") with synthetic ones that no constant comes near. What is
 rendered, at which resolution and with which texels: `recovery_truth.py`, `recovery_pictures.py`. Fitted from grey, with
 metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, ("_paper") the paper's own rig with its
-lights together, ("_soft", no rivals) 16 views x an environment map in 3 positions, and ("_unknown", no rivals) 16 views
-under one that stands still and is solved for too. Texel figures are over the surface that at least three cameras see,
-weighted by area; "confident_" ones over the 95 % of it that the fit trusts most; "within_" ones are the share of it
-whose error is within the fit's own standard deviation. Relit: four lights of no reference, cameras between theirs, mean
-over the pictures.
+lights together, ("_soft", no rivals) 16 views x an environment map in 3 positions, ("own_soft", printed as NAME_soft)
+the same with the object's own maps, and ("_unknown", no rivals) 16 views under one that stands still and is solved for
+too. Texel figures are over the surface that at least three cameras see, weighted by area; "confident_" ones over the
+95 % of it that the fit trusts most; "within_" ones are the share of it whose error is within the fit's own standard
+deviation. Relit: four lights of no reference, cameras between theirs, mean over the pictures.
 
 `figures` are ours. `baselines`: "constant" is the best map of one value; "other_seed" is the truth, relit with other
 random numbers than all others share: what two noisy renders of equal maps differ by; "together" is ours from the same
@@ -41,7 +41,7 @@ from mistyle.render.mitsuba.scene import Frame
 
 LEAST_VIEWS = 3
 RELIT_SPP = 128  # least samples of relit pictures: their own noise counts as an error of the maps
-KINDS = ("real", "strong", "paper", "soft", "unknown")
+KINDS = ("real", "strong", "paper", "soft", "own_soft", "unknown")
 RIVALS = ("together", *LOOPS)
 USUAL = ("together", "naive", "naive_pyramid")
 
@@ -58,12 +58,12 @@ class Row:
     @property
     def strong(self) -> bool:
         """Whether its maps are the synthetic ones."""
-        return self.kind != "real"
+        return self.kind not in ("real", "own_soft")
 
     @property
     def soft(self) -> bool:
         """Whether an environment lights it, which no rival can take."""
-        return self.kind in ("soft", "unknown")
+        return self.kind in ("soft", "own_soft", "unknown")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -161,7 +161,8 @@ def rows(options: argparse.Namespace) -> list[Row]:
 
 
 def label(row: Row) -> str:
-    return row.name + {"real": "", "strong": "_strong"}.get(row.kind, f"_strong_{row.kind}")
+    own = {"real": "", "strong": "_strong", "own_soft": "_soft"}
+    return row.name + own.get(row.kind, f"_strong_{row.kind}")
 
 
 def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, float]], list[str]]:
