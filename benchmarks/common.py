@@ -42,12 +42,12 @@ def timed(figures: dict[str, float], name: str, work: Callable[[], T]) -> T:
 
 
 def run_mistyle(*words: Any) -> Any:
-    """The JSON that `mistyle WORDS --json` prints; SystemExit where it fails."""
+    """The JSON that `mistyle WORDS --json` prints, {} where it prints none; SystemExit where it fails."""
     command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ)
     if done.returncode != 0:
         raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}")
-    return json.loads(done.stdout)
+    return json.loads(done.stdout) if done.stdout.strip().startswith("{") else {}
 
 
 def peak_gb() -> float:

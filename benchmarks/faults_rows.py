@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common import PROGRAM
 from benchmarks.faults_jobs import SMALL, Job, begin, differences, finish, left_over, until
 from benchmarks.faults_kills import Whole
 from mistyle.core.paths import scenes
@@ -239,8 +240,7 @@ def native(wholes: Mapping[str, Whole], folder: Path) -> Iterator[Row]:
             yield row(how, "one shard of a batch", told, done=code == 0 and not found, in_its_log=noted)
 
 
-# A command line, and one on a machine (or in a control group) that says it has so much memory.
-PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main(sys.argv[1:]))"
+# The command line on a machine (or in a control group) that says it has so much memory.
 POOR = f"from mistyle.process import memory; memory.limit = lambda: MOST; {PROGRAM}"
 MATERIALS, MOST = 200, 1.5  # of the mesh; GB
 

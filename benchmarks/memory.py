@@ -12,13 +12,12 @@ import argparse
 import hashlib
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import finish
+from benchmarks.common import finish, run_mistyle
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 SPOT, BUNNY = DATA / "meshes/plain/spot.obj", DATA / "meshes/plain/stanford-bunny.obj"
@@ -35,7 +34,6 @@ STYLIZE: dict[str, list[Any]] = {
 }
 TILED = [*DRAFT, "--atlas", "8192", "--set", "rig.kind=turntable", "--set", "rig.views=64"]
 FITS = {"fit_256": (256, 256, 16), "fit_512": (512, 256, 16), "fit_200": (1024, 128, 200)}  # atlas, pixels, pictures
-PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"
 
 
 def main() -> None:
@@ -66,23 +64,14 @@ def main() -> None:
     finish(figures, chosen.json)
 
 
-def mistyle(*words: Any) -> dict[str, Any]:
-    """Run a command; what it prints with --json."""
-    command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode != 0:
-        raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}: {done.stderr[-2000:]}")
-    return json.loads(done.stdout) if done.stdout.strip().startswith("{") else {}
-
-
 def error(estimate: float, peak: float) -> dict[str, float]:
     return {"estimate_gb": estimate, "peak_gb": peak, "error": estimate / peak - 1}
 
 
 def stylized(out: Path, words: list[Any], stages: bool) -> dict[str, float]:
     """Estimate and peak of a job."""
-    told = mistyle(*words, "-o", out, "--dry-run")
-    made = mistyle(*words, "-o", out)
+    told = run_mistyle(*words, "-o", out, "--dry-run")
+    made = run_mistyle(*words, "-o", out)
     if stages:
         show(told.get("peaks_gb", {}), out)
     return error(told["memory_gb"], made["peak_gb"])
@@ -97,11 +86,11 @@ def fitted(out: Path, atlas: int, side: int, pictures: int, stages: bool) -> dic
 
     views, light = out / "pictures", out / "lights.json"
     rig = ["--rig", "turntable", "--set", f"rig.views={pictures}"]
-    mistyle("render", SPOT, "-o", views, "--resolution", side, "--spp", "4", *rig)
+    run_mistyle("render", SPOT, "-o", views, "--resolution", side, "--spp", "4", *rig)
     # Not what lit them: memory does not hang on how well the pictures are explained.
     light.write_text(json.dumps(to_json(lights("phase1"))))
     few = ["--lights", light, "--set", "recover.iterations=32", "--set", "report.frames=4"]
-    made = mistyle("fit", SPOT, views, "-o", out / "fit", "--atlas", atlas, *few)
+    made = run_mistyle("fit", SPOT, views, "-o", out / "fit", "--atlas", atlas, *few)
     settings = MaterialSettings.model_validate(json.loads((out / "fit" / "run.json").read_text())["settings"])
     count = [side**2] * pictures
     if stages:
@@ -113,15 +102,15 @@ def budget(out: Path, quick: bool) -> dict[str, float]:
     """A job that would take more than it is given, without gradients, and the same without a budget."""
     size, asked = ("1024", 1.25) if quick else ("4096", 2.2)
     words = ["stylize", SPOT, WAVE, *DRAFT, "--atlas", size, "--refine", "off"]
-    free = mistyle(*words, "-o", out / "free")
-    made = mistyle(*words, "-o", out / "kept", "--memory", f"{asked}G")
+    free = run_mistyle(*words, "-o", out / "free")
+    made = run_mistyle(*words, "-o", out / "kept", "--memory", f"{asked}G")
     same = assets(out / "free") == assets(out / "kept")
     return {"free_gb": free["peak_gb"], "asked_gb": asked, "peak_gb": made["peak_gb"], "same_bytes": float(same)}
 
 
 def tiled(out: Path, asked: float) -> dict[str, float]:
     """What a job that is far too large for its budget held of main memory."""
-    made = mistyle("stylize", SPOT, WAVE, *TILED, "-o", out, "--memory", f"{asked}G")
+    made = run_mistyle("stylize", SPOT, WAVE, *TILED, "-o", out, "--memory", f"{asked}G")
     return {"asked_gb": asked, "peak_gb": made["peak_gb"]}
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from benchmarks.common import PROGRAM
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.core.image import srgb_from_linear
@@ -21,7 +22,6 @@ from mistyle.io.cameras.captures import read_captures, read_shots, reading_notes
 from mistyle.io.read import read_frame, read_picture
 from mistyle.io.read_mesh import MESHES, read_mesh
 
-PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main(sys.argv[1:]))"
 PIXELS = 64  # along each side of a drawn mesh
 LIMIT = 600.0  # seconds of one command
 # What points to the right and up in a picture taken from that side; the mesh is as the reader has it, Y up.
