@@ -27,6 +27,7 @@ from mistyle.core.stage_progress import StageProgress
 from mistyle.process import stopping
 from mistyle.render.deferred.image_samples import window
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
+from mistyle.render.mitsuba.device import give_back
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
@@ -278,6 +279,7 @@ class _Work:
         # The estimate of `state` stays in memory: a stop request during the pass writes its maps.
         prepared = replace(state, estimate=self.estimate(state), solution=None)
         self._level = None
+        give_back()
         return prepared
 
     def _after(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:

@@ -35,6 +35,8 @@ from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
 from mistyle.solver.photometry.record import Photometry
 
+TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
+
 
 @dataclass(frozen=True)
 class Placed:
@@ -326,7 +328,7 @@ def measure(
     converted: list[float] = []
     shown_pictures = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
     for k in range(len(captures)):
-        first = renderer_of(traced, subset(captures, [k]), sizes, chosen)
+        first = renderer_of(traced, subset(captures, [k]), sizes, chosen, TWICE if k in shown_pictures else 0)
         rendered = [first.image_and_coverage(table, 0)]
         if k in shown_pictures:
             rendered.append(first.with_model(second_model).image_and_coverage(table, 0))
@@ -351,10 +353,10 @@ def measure(
     )
 
 
-def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any) -> Any:
-    """The renderer of the one picture of `captures`; it keeps the picture's samples."""
+def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any, memory: float) -> Any:
+    """The renderer of the one picture of `captures`; it keeps at most `memory` bytes of the picture's samples."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
     subsamples = chosen.soft_subsamples if has_soft(captures.lights) else chosen.subsamples
-    options = RenderOptions(chosen.model, chosen.frame, subsamples, gradients=False)
+    options = RenderOptions(chosen.model, chosen.frame, subsamples, memory=memory, gradients=False)
     return MaterialRenderer(traced, captures, sizes, options)
