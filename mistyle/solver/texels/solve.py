@@ -276,8 +276,8 @@ def _on_atlas(
         scatter(std, observed, atlas, np.array(recover_prior.PRIOR_SPREAD, np.float32)),
         scatter(data_weight, observed, atlas, 1),
         scatter(unconstrained, observed, atlas, recover_prior.NOTHING),
-        scatter(observed.seen, observed, atlas, 0),
-        scatter(observed.views, observed, atlas, 0),
+        scatter(observed.seen.astype(np.int32), observed, atlas, 0),
+        scatter(observed.views.astype(np.int32), observed, atlas, 0),
         solved,
     )
 
