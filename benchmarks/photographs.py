@@ -12,11 +12,12 @@ pixels wide, and the same averaged until it is two and one: `texel_of_4.…`, `t
 `normal_mean_deg`, `roughness_mse`, `albedo_psnr` and `seconds`. --quick runs it small, and a `large` of 6 pictures of 3
 megapixels.
 
-`real_size` (only by `--only real_size`): the first pass, or those of --minutes, of a fit of an atlas of 4096² to 200
-photographs of 12 megapixels (links to 12 renders) within --memory. Figures: `real_size.pictures`, `.megapixels`,
-`.atlas`, `.asked_gb`, `.estimate_gb` (the plan), `.peak_gb` (resident, of all processes together), `.peak_over_estimate`,
-`.seconds`, `.passes`, `.passes_planned`, `.whole_seconds_planned`, and `.whole_seconds_extrapolated`: all passes at the
-ratio of seconds to planned seconds of those done. `--quick --atlas 512 --pictures 12 --memory 4` only shows that it works.
+`real_size` (only by `--only real_size`): a fit of an atlas of 4096² to 200 photographs of 12 megapixels (links to 12
+renders) within --memory. Memory does not depend on the number of steps: without --minutes every pass has few. Figures:
+`real_size.pictures`, `.megapixels`, `.atlas`, `.asked_gb`, `.estimate_gb` (the plan), `.peak_gb` (resident, of all
+processes together), `.peak_over_estimate`, `.seconds`, `.passes`, `.passes_planned`, `.whole_seconds_planned`, and
+`.whole_seconds_extrapolated`: all passes of the usual settings, at the ratio of seconds to planned seconds of those
+done. `--quick --atlas 512 --pictures 12 --memory 4` only shows that it works.
 """
 
 import argparse
@@ -62,6 +63,7 @@ from mistyle.solver.validate import downsampling_factors
 
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024
+FEW = [f"--set=recover.{name}" for name in ("rounds=1", "bounces=1", "bounce_samples=4", "iterations=4")]
 PARTS = ("large", "strong", "real_size")
 FINEST = 4
 
@@ -74,7 +76,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=200, help="of real_size")
     parser.add_argument("--atlas", type=int, default=4096, help="of real_size")
     parser.add_argument("--memory", type=float, default=16.0, help="of real_size, GB")
-    parser.add_argument("--minutes", type=float, default=0.0, help="of real_size; 0: one pass")
+    parser.add_argument("--minutes", type=float, default=0.0, help="of real_size; 0: all passes, with few steps")
     parser.add_argument("--keep", type=Path, help="folder for the photographs and the run, to look at afterwards")
     options = parser.parse_args()
     figures: dict[str, float] = {}
@@ -95,7 +97,11 @@ def large(place: Path, views: int, side: int) -> dict[str, float]:
     captures = read_captures(folder, saturation=0.99)
     asset = read_mesh(mesh)
     by = downsampling_factors([rasterise(asset.mesh, 0, ATLAS)], captures.cameras)
-    figures: dict[str, float] = {"large.pictures": float(count), "large.megapixels": side * side / 1e6, "large.block": float(by[0])}
+    figures: dict[str, float] = {
+        "large.pictures": float(count),
+        "large.megapixels": side * side / 1e6,
+        "large.block": float(by[0]),
+    }
     figures["large.read_seconds"] = _seconds(lambda: captures.load(0))
     for name, seen in (("large", captures), ("large.averaged", shrunk(captures, by))):
         rgb, counts = seen.load(0)
@@ -155,24 +161,23 @@ def photograph(mesh: Path, folder: Path, views: int, size: tuple[int, int], radi
 
 
 def real_size(place: Path, options: argparse.Namespace) -> dict[str, float]:
-    """The first passes of a fit to so many photographs, within a budget: its peak, and the time of the whole."""
+    """A fit to so many photographs within a budget, of the first passes or of few steps of each kind: its peak, and the
+    seconds of the whole."""
     mesh, folder = find_asset("waterbottle", data_folder()), place / "real_photographs"
     size, views = ((480, 640), 2) if options.quick else ((3000, 4000), 4)
     count = photograph(mesh, folder, views, size, (0.0, 0.0, 0.0), max(1, options.pictures // (3 * views)))
     words = ["fit", mesh, folder, "-o", place / "real_run", "--set", "references.saturation=0.99"]
     words += ["--atlas", options.atlas, "--memory", f"{options.memory:g}G", "--set", "report.frames=4"]
-    planned = run_mistyle(*words, "--dry-run")
-    words += ["--minutes", options.minutes] if options.minutes else ["--passes", 1]
+    planned = run_mistyle(*words, "--dry-run")  # with the usual steps
+    words += ["--minutes", options.minutes] if options.minutes else FEW
     start = time.perf_counter()
     with tree_peak() as most:
         told = run_mistyle(*words)
     seconds, done = time.perf_counter() - start, told["passes"]["done"]
     settings = MaterialSettings.model_validate(json.loads((place / "real_run/run.json").read_text())["settings"])
     pixels, covered = [size[0] * size[1]] * count, COVERED * options.atlas**2
-    whole, first = (
-        recover_seconds(settings.model_copy(update={"passes": passes}), pixels, covered, False, SHOWN)
-        for passes in (0, done)
-    )
+    first = recover_seconds(settings.model_copy(update={"passes": done}), pixels, covered, False, SHOWN)
+    whole = recover_seconds(settings.model_copy(update={"recover": RecoverSettings()}), pixels, covered, False, SHOWN)
     print(json.dumps({"seconds": told["seconds"], "peaks_gb": told["peaks_gb"], "planned": planned}), file=sys.stderr)
     rest = sum(told["seconds"].values()) - told["seconds"]["recover"]
     figures = {

@@ -24,7 +24,7 @@ from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.stage_progress import StageProgress
-from mistyle.process import stopping
+from mistyle.process import memory, stopping
 from mistyle.render.deferred.image_samples import window
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
 from mistyle.render.mitsuba.device import give_back
@@ -277,7 +277,7 @@ class _Work:
         if one.kind in ("solve", "rounds") or state.estimate is not None:
             return state
         # The estimate of `state` stays in memory: a stop request during the pass writes its maps.
-        prepared = replace(state, estimate=self.estimate(state), solution=None)
+        prepared = replace(state, estimate=memory.away(self.estimate(state)), solution=None)
         self._level = None
         give_back()
         return prepared

@@ -38,8 +38,8 @@ ELSEWHERE = 0.1  # weight of the whole atlas in the local spread, in exactly kno
 SHARE = 0.3  # precision of a tilt relative to 1 / spread², since its neighbours are correlated
 WIDER = 2.0  # factor of the variance across a seam: the linked texel lies beside the neighbour's true place
 STEPS, CLOSE = 300, 1e-4  # most iterations of conjugate gradients, and their relative residual
-# Texels of a set that are solved at once. A larger set is solved in bands of rows; a band's own texels lie HALO rows from
-# the rest, which is several correlation lengths of LEAST and OPEN.
+# Texels of a set that are solved at once. A larger set is solved in bands of rows, each with HALO rows on either side,
+# which are several correlation lengths of LEAST and OPEN.
 WHOLE, BAND, HALO = 2**22, 2**20, 64
 
 Grid = Float[np.ndarray, "h w"]
@@ -245,7 +245,9 @@ def _map_estimate(one: Field) -> Float[np.ndarray, "h w"]:
     return result
 
 
-def _change(prior: Any, error: Grid, estimate: Grid, beyond: Float[np.ndarray, " n"] | None) -> Float[np.ndarray, "h w"]:
+def _change(
+    prior: Any, error: Grid, estimate: Grid, beyond: Float[np.ndarray, " n"] | None
+) -> Float[np.ndarray, "h w"]:
     """The change from the estimate, which has smaller rounding errors than the minimum itself; `beyond`: the gradient's
     part that texels outside the grid give."""
     from scipy.sparse import dia_array

@@ -5,6 +5,7 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
+from mistyle.process import memory
 from mistyle.solver.schedule import COVERED, SEEN, SHOWN
 from mistyle.solver.settings import joint_steps
 
@@ -22,6 +23,8 @@ MATERIAL = {
     "report": Need(0.74, texel=200, drawn=70, frame=24, look=6, picture=570),
 }
 MATERIAL = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in MATERIAL.items()}
+# Bytes of a texel that lie in files where the budget is small.
+IN_FILES = {"pictures": 33, "recover": 150, "measure": 74, "asset": 74, "scene": 74, "report": 74}
 KEEPING = ("recover", "measure", "asset", "scene", "report")
 SAMPLE = 32  # cached bytes per sample of a picture
 # The settings that save memory when halved.
@@ -56,12 +59,26 @@ def averaged_pixels(settings: Any, pixels: Sequence[int]) -> list[int]:
 def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> float:
     """Peak memory of a fit, GB; `pixels` are those of each picture."""
     count = material_counts(settings, pixels, faces, sets, own)
-    gb_of = peaks(MATERIAL, count)
+    gb_of = peaks(needs_of(settings, pixels, faces, sets, own), count)
     samples = max(settings.recover.subsamples, joint_steps(settings.recover) and settings.recover.joint_subsamples)
     cached = min(settings.recover.memory, SAMPLE * count.view * samples / 1e9)
     cached += indirect_gb(settings, pixels)
     gb_of |= {stage: gb_of[stage] + cached for stage in KEEPING}
     return round(max(gb_of.values()), 2)
+
+
+def in_files(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> bool:
+    """Whether texels, the texels' estimate and maps must lie in files for the fit to keep to its budget."""
+    count = material_counts(settings, pixels, faces, sets, own)
+    least = max(peaks(MATERIAL, count).values()) + indirect_gb(settings, pixels)
+    return memory.possible() and least > allowed(settings).gb
+
+
+def needs_of(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> dict[str, Need]:
+    """The stages' needs, with or without arrays in files."""
+    if not in_files(settings, pixels, faces, sets, own):
+        return MATERIAL
+    return {stage: need._replace(texel=need.texel - IN_FILES.get(stage, 0)) for stage, need in MATERIAL.items()}
 
 
 def indirect_gb(settings: Any, pixels: Sequence[int]) -> float:
@@ -79,14 +96,16 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
     A fit leaves out steps for which `recover.memory` is too small. Without `--memory` nothing is reduced: a fit that is
     too large for the machine is refused.
     """
-    budget = allowed(settings)
+    budget, size = allowed(settings), (faces, sets, own)
 
     def least(chosen: Any) -> float:
-        return material_gb(with_setting(chosen, "recover.memory", 1e-9), pixels, faces, sets, own)
+        return material_gb(with_setting(chosen, "recover.memory", 1e-9), pixels, *size)
 
     needed, left = least(settings), float(settings.recover.memory)
     if budget.given:
-        left = budget.gb - max(peaks(MATERIAL, material_counts(settings, pixels, faces, sets, own)).values())
+        left = budget.gb - max(
+            peaks(needs_of(settings, pixels, *size), material_counts(settings, pixels, *size)).values()
+        )
         left -= indirect_gb(settings, pixels)
     elif (whole := material_gb(settings, pixels, faces, sets, own)) > budget.gb >= needed:
         raise UsageError(

@@ -25,7 +25,7 @@ def level_captures(texels: Sequence[Texels], captures: Captures, memory: float) 
 
 
 def _block(camera: Camera, most: int) -> int:
-    """Pixels along a block's side: at most `most`, and a divisor of those of an estimate of indirect light, which serves
+    """Pixels along a block's side: at most `most`, and a divisor of those of an estimate of indirect light: it serves
     both resolutions."""
     if camera.size[0] * camera.size[1] <= LARGE:
         return 1
