@@ -166,6 +166,8 @@ def recover(
             camera.name: _residual(state.direct, renderer.image_and_coverage(uploaded, k), k)
             for k, camera in enumerate(usable.cameras)
         }
+    del renderer, uploaded, work
+    give_back()
     progress(1.0)
     return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
 
