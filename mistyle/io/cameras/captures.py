@@ -396,6 +396,8 @@ def _alpha(shot: CapturedPicture, decoded: Picture | None = None) -> Float[np.nd
     """The alpha of the picture (`decoded`, if available), or of the EXR that it replaces."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")
+    if decoded is None and shot.alpha_of is None and shot.picture.suffix.lower() in (".jpg", ".jpeg"):
+        return None  # without decoding it
     picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded
     if picture.alpha is not None or shot.alpha_of is None:
         return picture.alpha
