@@ -4,7 +4,7 @@ import numpy as np
 from test_recover import SIZE, errors, world  # noqa: F401  (a fixture)
 
 from mistyle.atlas.texels import rasterise
-from mistyle.core.capture import shrunk, subset
+from mistyle.core.capture import shrunk
 from mistyle.solver import indirect
 from mistyle.solver.recover import recover
 from mistyle.solver.schedule import OBSERVED, SEEN, solver_level
@@ -40,7 +40,6 @@ def test_averages_are_kept_where_memory_allows(world, monkeypatch):  # noqa: F81
 def test_a_coarse_level_finds_as_much_on_averages(world, monkeypatch):  # noqa: F811
     """Less than 1 dB of albedo is lost, with pictures of 80² averaged to 20²; with estimates of indirect light."""
     mesh, maps, texels, captures = world
-    captures = subset(captures, range(0, len(captures), 2))
     chosen = RecoverSettings(iterations=0, rounds=1, bounces=1, bounce_samples=8, solver_texels=300)
     found = []
     for lower in (False, True):
