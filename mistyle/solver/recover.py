@@ -214,6 +214,7 @@ class _Work:
                 journal.save()
                 return state_from(journal.state, context), len(planned)
             state = replace(state, done=k + 1)
+            give_back()
             limits.watch(Reached(k + 1, len(planned), self, state))
         if state.done < len(planned):
             # A later call with wider limits continues here.

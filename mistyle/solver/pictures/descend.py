@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from mistyle.core.maps import place_of
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import COLUMNS, SOLVED, TILT, MaterialTable
-from mistyle.render.mitsuba.device import give_back
 from mistyle.solver.context import FitContext
 from mistyle.solver.journal import Journal
 from mistyle.solver.pass_state import PassState
@@ -65,7 +64,6 @@ def picture_pass(
             renderer.retarget(direct.direct_only(), direct.pixel_confidence, [k])
     part = progress.part(0.4, 1) if one.samples else progress
     table = _descend(context, renderer, estimate, (base, one), part, journal)
-    give_back()
     return replace(state, table=table, direct=direct)
 
 
