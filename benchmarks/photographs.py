@@ -11,14 +11,24 @@ it finds.) Figures: `large.pictures`, `large.megapixels`, `large.block` (pixels 
 pixels wide, and the same averaged until it is two and one: `texel_of_4.…`, `texel_of_2.…`, `texel_of_1.…` with
 `normal_mean_deg`, `roughness_mse`, `albedo_psnr` and `seconds`. --quick runs it small, and a `large` of 6 pictures of 3
 megapixels.
+
+`real_size` (only by `--only real_size`): a fit of an atlas of 4096² to 200 photographs of 12 megapixels (links to 12
+renders) within --memory. Memory does not depend on the number of steps: without --minutes every pass has few. Figures:
+`real_size.pictures`, `.megapixels`, `.atlas`, `.asked_gb`, `.estimate_gb` (the plan), `.peak_gb` (resident, of all
+processes together), `.peak_over_estimate`, `.seconds`, `.passes`, `.passes_planned`, `.whole_seconds_planned`, and
+`.whole_seconds_extrapolated`: all passes of the usual settings, at the ratio of seconds to planned seconds of those
+done. `--quick --atlas 512 --pictures 12 --memory 4` only shows that it works.
 """
 
 import argparse
 import json
+import os
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -37,6 +47,7 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
 from mistyle.core.maps import flat_maps
 from mistyle.fitting.pipeline.budget import material_gb
+from mistyle.fitting.pipeline.times import recover_seconds
 from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.geometry.lens import Lens, distort
 from mistyle.io.cameras.camera_files import transforms
@@ -46,11 +57,14 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.solver.recover import recover
+from mistyle.solver.schedule import COVERED, SHOWN
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.validate import downsampling_factors
 
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024
+FEW = [f"--set=recover.{name}" for name in ("rounds=1", "bounces=1", "bounce_samples=4", "iterations=4")]
+PARTS = ("large", "strong", "real_size")
 FINEST = 4
 
 
@@ -58,7 +72,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.photographs", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="small sizes")
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--only", choices=("large", "strong"), action="append", help="only this part (repeatable)")
+    parser.add_argument("--only", choices=PARTS, action="append", help="only this part (repeatable)")
+    parser.add_argument("--pictures", type=int, default=200, help="of real_size")
+    parser.add_argument("--atlas", type=int, default=4096, help="of real_size")
+    parser.add_argument("--memory", type=float, default=16.0, help="of real_size, GB")
+    parser.add_argument("--minutes", type=float, default=0.0, help="of real_size; 0: all passes, with few steps")
     parser.add_argument("--keep", type=Path, help="folder for the photographs and the run, to look at afterwards")
     options = parser.parse_args()
     figures: dict[str, float] = {}
@@ -67,17 +85,23 @@ def main() -> None:
             figures |= large(options.keep or Path(scratch), *((2, 1732) if options.quick else (8, 3464)))
         if "strong" in (options.only or ["strong"]):
             figures |= strong(64 if options.quick else 128)
+        if "real_size" in (options.only or []):
+            figures |= real_size(options.keep or Path(scratch), options)
     finish(figures, options.json)
 
 
 def large(place: Path, views: int, side: int) -> dict[str, float]:
     """Photographs made, read, predicted once as they are and averaged, and fitted to."""
     mesh, folder = find_asset("waterbottle", data_folder()), place / "photographs"
-    count = photograph(mesh, folder, views, side)
+    count = photograph(mesh, folder, views, (side, side))
     captures = read_captures(folder, saturation=0.99)
     asset = read_mesh(mesh)
     by = downsampling_factors([rasterise(asset.mesh, 0, ATLAS)], captures.cameras)
-    figures = {"large.pictures": float(count), "large.megapixels": side * side / 1e6, "large.block": float(by[0])}
+    figures: dict[str, float] = {
+        "large.pictures": float(count),
+        "large.megapixels": side * side / 1e6,
+        "large.block": float(by[0]),
+    }
     figures["large.read_seconds"] = _seconds(lambda: captures.load(0))
     for name, seen in (("large", captures), ("large.averaged", shrunk(captures, by))):
         rgb, counts = seen.load(0)
@@ -95,34 +119,114 @@ def large(place: Path, views: int, side: int) -> dict[str, float]:
     return figures
 
 
-def photograph(mesh: Path, folder: Path, views: int, side: int) -> int:
-    """Write JPEGs of the object in its own material, their cameras and lights; how many. Direct light only."""
+def photograph(mesh: Path, folder: Path, views: int, size: tuple[int, int], radial=RADIAL, copies: int = 1) -> int:
+    """Write JPEGs of the object in its own material, their cameras and lights; how many. Direct light only.
+
+    `copies` of each are links, with cameras 1e-6 apart, so that no two are one camera.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     asset = read_mesh(mesh)
-    cameras = [replace(c, focal=1.25 * c.focal) for c in drawing.fibonacci(views, side)]
-    lens = Lens((cameras[0].focal,) * 2, cameras[0].centre, cameras[0].size, RADIAL)
+    centre = (size[1] / 2, size[0] / 2)
+    cameras = [replace(c, focal=1.25 * c.focal, size=size, centre=centre) for c in drawing.fibonacci(views, size[0])]
+    lens = Lens((cameras[0].focal,) * 2, cameras[0].centre, cameras[0].size, radial)
     where = _bent(lens, cameras[0])
     shots = drawing.one_at_a_time(cameras)
     exposure = None
-    lit, files = {}, []
+    lit, files, taken = {}, [], []
     for shot, picture in zip(shots, _pictures(asset, shots), strict=True):
         if exposure is None:
             exposure = 0.8 / float(np.quantile(picture[picture.max(axis=-1) > 0], 0.999))
         bent = cv2.remap(picture * exposure, *where, cv2.INTER_LINEAR)
-        name = f"{shot.camera.name}.jpg"
         encoded = (255 * srgb_from_linear(np.clip(bent, 0, 1)) + 0.5).astype(np.uint8)
-        cv2.imwrite(str(folder / name), encoded[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-        files.append(name)
-        lit[shot.camera.name] = tuple(
+        lights = tuple(
             replace(light, irradiance=tuple(exposure * x for x in light.irradiance))
             for light in shot.lights
             if isinstance(light, Directional)
         )
-    tree = transforms([shot.camera for shot in shots], files)
-    tree |= {"camera_model": "OPENCV", "k1": RADIAL[0], "k2": RADIAL[1], "k3": RADIAL[2]}
+        for copy in range(copies):
+            pose, name = shot.camera.world_from_cam.copy(), f"{shot.camera.name}_{copy}" if copy else shot.camera.name
+            pose[:3, 3] += 1e-6 * copy
+            files.append(f"{name}.jpg")
+            if copy:
+                (folder / files[-1]).symlink_to(files[-1 - copy])
+            else:
+                cv2.imwrite(str(folder / files[-1]), encoded[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+            taken.append(replace(shot.camera, name=name, world_from_cam=pose))
+            lit[name] = lights
+    tree = transforms(taken, files)
+    tree |= {"camera_model": "OPENCV", "k1": radial[0], "k2": radial[1], "k3": radial[2]}
     (folder / "transforms.json").write_text(json.dumps(tree))
     (folder / "lights.json").write_text(json.dumps(to_json((), lit)))
-    return len(shots)
+    return len(taken)
+
+
+def real_size(place: Path, options: argparse.Namespace) -> dict[str, float]:
+    """A fit to so many photographs within a budget, of the first passes or of few steps of each kind: its peak, and the
+    seconds of the whole."""
+    mesh, folder = find_asset("waterbottle", data_folder()), place / "real_photographs"
+    size, views = ((480, 640), 2) if options.quick else ((3000, 4000), 4)
+    count = photograph(mesh, folder, views, size, (0.0, 0.0, 0.0), max(1, options.pictures // (3 * views)))
+    words = ["fit", mesh, folder, "-o", place / "real_run", "--set", "references.saturation=0.99"]
+    words += ["--atlas", options.atlas, "--memory", f"{options.memory:g}G", "--set", "report.frames=4"]
+    planned = run_mistyle(*words, "--dry-run")  # with the usual steps
+    words += ["--minutes", options.minutes] if options.minutes else FEW
+    start = time.perf_counter()
+    with tree_peak() as most:
+        told = run_mistyle(*words)
+    seconds, done = time.perf_counter() - start, told["passes"]["done"]
+    settings = MaterialSettings.model_validate(json.loads((place / "real_run/run.json").read_text())["settings"])
+    pixels, covered = [size[0] * size[1]] * count, COVERED * options.atlas**2
+    first = recover_seconds(settings.model_copy(update={"passes": done}), pixels, covered, False, SHOWN)
+    whole = recover_seconds(settings.model_copy(update={"recover": RecoverSettings()}), pixels, covered, False, SHOWN)
+    print(json.dumps({"seconds": told["seconds"], "peaks_gb": told["peaks_gb"], "planned": planned}), file=sys.stderr)
+    rest = sum(told["seconds"].values()) - told["seconds"]["recover"]
+    figures = {
+        "pictures": float(count), "megapixels": size[0] * size[1] / 1e6, "atlas": float(options.atlas),
+        "asked_gb": options.memory, "estimate_gb": planned["memory_gb"], "peak_gb": most[0] / 1e9,
+        "peak_over_estimate": most[0] / 1e9 / planned["memory_gb"], "seconds": seconds, "passes": float(done),
+        "passes_planned": float(told["passes"]["planned"]), "whole_seconds_planned": float(planned["seconds"]),
+        "whole_seconds_extrapolated": rest + told["seconds"]["recover"] * whole / first,
+    }  # fmt: skip
+    return {f"real_size.{name}": value for name, value in figures.items()}
+
+
+@contextmanager
+def tree_peak() -> Iterator[list[int]]:
+    """The most bytes that this process's descendants hold together, read ten times a second: a list of one number."""
+    most, done = [0], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.1):
+            most[0] = max(most[0], sum(map(_resident, _descendants(os.getpid()))))
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield most
+    finally:
+        done.set()
+        thread.join()
+
+
+def _descendants(process: int) -> list[int]:
+    found, new = [], [process]
+    while new:
+        try:
+            files = Path(f"/proc/{new[-1]}/task").glob("*/children")
+            new = [int(child) for file in files for child in file.read_text().split()] + new[:-1]
+        except OSError:  # it has ended
+            new.pop()
+            continue
+        found += [child for child in new if child not in found]
+    return found
+
+
+def _resident(process: int) -> int:
+    try:
+        lines = Path(f"/proc/{process}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmRSS:"))
 
 
 def _pictures(asset, shots) -> Iterator[np.ndarray]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Texels
@@ -32,6 +33,7 @@ class FitContext:
     captures  the reference pictures with all their light
     notes     sentences for the report, in chronological order
     trace     values per round and step, by name
+    cameras   of the pictures themselves, where `captures` are averages of them
     """
 
     traced: Tracer
@@ -43,6 +45,7 @@ class FitContext:
     seed: int = 0
     notes: list[str] = field(default_factory=list)
     trace: dict[str, list[float]] = field(default_factory=dict)
+    cameras: tuple[Camera, ...] = ()
 
     def renderer(
         self, subsamples: int | None = None, memory: float | None = None, gradients: bool = False

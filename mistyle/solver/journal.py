@@ -15,6 +15,7 @@ import numpy as np
 from mistyle.process import stopping
 
 Arrays = dict[str, np.ndarray]
+SELDOM = 10  # least ratio of the seconds between two checkpoints to those of writing one, gigabytes of a large atlas
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Journal:
 
     def __init__(self, checkpoints: Checkpoints, every: float, deadline: float = float("inf")) -> None:
         self.checkpoints, self.every, self.deadline = checkpoints, every, deadline
-        self.saved, self.done = time.monotonic(), 0
+        self.saved, self.done, self.took = time.monotonic(), 0, 0.0
         self.state: Arrays = {}
         self.parts: dict[str, Arrays] = {}
         self.earlier: dict[str, Arrays] = {}
@@ -73,7 +74,7 @@ class Journal:
 
         `arrays` are a part in progress, which `name` recalls.
         """
-        if stopping.asked() or time.monotonic() - self.saved > self.every:
+        if stopping.asked() or time.monotonic() - self.saved > max(self.every, SELDOM * self.took):
             self.save({} if arrays is None else {name: arrays()})
         stopping.check()
         if self.done and time.monotonic() > self.deadline:
@@ -87,8 +88,10 @@ class Journal:
         # Parts of the interrupted run that were not reached again are still valid.
         for part, arrays in {**self.earlier, **self.parts, **(running or {})}.items():
             flat |= {f"part/{part}/{name}": value for name, value in arrays.items()}
+        begun = time.monotonic()
         self.checkpoints.save(flat)
         self.saved = time.monotonic()
+        self.took = self.saved - begun
 
 
 def text_array(value: Any) -> np.ndarray:

@@ -24,9 +24,10 @@ from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.stage_progress import StageProgress
-from mistyle.process import stopping
+from mistyle.process import memory, stopping
 from mistyle.render.deferred.image_samples import window
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
+from mistyle.render.mitsuba.device import give_back
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
@@ -165,6 +166,8 @@ def recover(
             camera.name: _residual(state.direct, renderer.image_and_coverage(uploaded, k), k)
             for k, camera in enumerate(usable.cameras)
         }
+    del renderer, uploaded, work
+    give_back()
     progress(1.0)
     return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
 
@@ -211,6 +214,7 @@ class _Work:
                 journal.save()
                 return state_from(journal.state, context), len(planned)
             state = replace(state, done=k + 1)
+            give_back()
             limits.watch(Reached(k + 1, len(planned), self, state))
         if state.done < len(planned):
             # A later call with wider limits continues here.
@@ -276,8 +280,9 @@ class _Work:
         if one.kind in ("solve", "rounds") or state.estimate is not None:
             return state
         # The estimate of `state` stays in memory: a stop request during the pass writes its maps.
-        prepared = replace(state, estimate=self.estimate(state), solution=None)
+        prepared = replace(state, estimate=memory.away(self.estimate(state)), solution=None)
         self._level = None
+        give_back()
         return prepared
 
     def _after(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:

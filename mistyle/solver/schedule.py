@@ -26,6 +26,8 @@ MOST = 512  # pixels along the longer side of an estimate of indirect light
 # The object's share of a picture, the covered share of the atlas, and the share of that which one picture sees.
 SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 FILLED = 0.55  # the object's share of its bounding box in a picture, or of a picture without alpha or mask
+OBSERVED = 2**26  # most observations of the per-texel solver, of texels of which one picture sees SEEN
+LARGE = 4_000_000  # pixels of a picture from which it is averaged for a coarser level of that solver
 JUDGES = 48  # pictures whose loss accepts or rejects the steps on whole pictures
 RESTARTS = 3  # rounds in which texels also start from their neighbours' values
 CLASS_ROUNDS = 2  # rounds after each solve from the start in which metal and dielectric are both tried
@@ -103,9 +105,8 @@ def size_from(
 ) -> Size:
     """Counts of a fit to pictures of so many pixels and an atlas with `covered` texels, for an object that fills the
     share `shown` of each picture and of which one picture sees SEEN."""
-    solved = covered
-    while solved > settings.solver_texels / (SOFT_COST if soft else 1):
-        solved /= 4
+    by = solver_level(settings, covered, len(pixels), soft)
+    solved = covered / by**2
     subsamples = settings.soft_subsamples if soft else settings.subsamples
     area = shown * sum(pixels)
     return Size(
@@ -113,10 +114,20 @@ def size_from(
         covered,
         SEEN * solved * len(pixels),
         area * subsamples,
-        area * (1 if soft and solved < covered else subsamples),
+        shown * sum(n / by**2 if n > LARGE else n for n in pixels) * (1 if soft and by > 1 else subsamples),
         sum(min(n, MOST**2) for n in pixels),
         SKY_CELLS if soft else 0,
     )
+
+
+def solver_level(settings: RecoverSettings, covered: float, pictures: int, soft: bool) -> int:
+    """How many times coarser than the atlas the per-texel solver's level is: it has at most `solver_texels` texels, and
+    OBSERVED observations."""
+    most = settings.solver_texels / (SOFT_COST if soft else 1)
+    most, by = min(most, OBSERVED / (SEEN * max(pictures, 1))), 1
+    while settings.solver != "pictures" and covered / by**2 > most:
+        by *= 2
+    return by
 
 
 def collecting_seconds(settings: RecoverSettings, size: Size) -> float:

@@ -38,6 +38,9 @@ ELSEWHERE = 0.1  # weight of the whole atlas in the local spread, in exactly kno
 SHARE = 0.3  # precision of a tilt relative to 1 / spread², since its neighbours are correlated
 WIDER = 2.0  # factor of the variance across a seam: the linked texel lies beside the neighbour's true place
 STEPS, CLOSE = 300, 1e-4  # most iterations of conjugate gradients, and their relative residual
+# Texels of a set that are solved at once. A larger set is solved in bands of rows, each with HALO rows on either side,
+# which are several correlation lengths of LEAST and OPEN.
+WHOLE, BAND, HALO = 2**22, 2**20, 64
 
 Grid = Float[np.ndarray, "h w"]
 Line = Bool[np.ndarray, "h v"]  # texels with a neighbour on either side in their row
@@ -192,13 +195,20 @@ def _seam_differences(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndar
     return np.concatenate(rows).astype(np.int32), np.concatenate(firm)
 
 
-def _difference_matrix(variance: Grid, among: Links) -> Any:
-    """Sparse matrix of second differences, each row divided by its standard deviation."""
+def _difference_matrix(variance: Grid, among: Links, band: slice | None = None) -> Any:
+    """Sparse matrix of second differences, each row divided by its standard deviation; those of all texels, or of the
+    rows `band` of the grid."""
     from scipy.sparse import csr_array
 
-    texels, firm = map(
-        np.concatenate, zip(_grid_differences(variance, among), _seam_differences(variance, among), strict=True)
-    )
+    lines, first = slice(0, len(variance)) if band is None else band, 0
+    inside = Links(among.right[lines], among.below[lines.start : lines.stop - 1], among.seams)
+    texels, firm = _grid_differences(variance[lines], inside)
+    across, loose = _seam_differences(variance, among)
+    if band is not None:
+        first = lines.start * variance.shape[1]
+        here = (across[:, 2] >= first) & (across[:, 2] < lines.stop * variance.shape[1])
+        texels, across, loose = texels + np.int32(first), across[here], loose[here]
+    texels, firm = np.concatenate([texels, across]), np.concatenate([firm, loose])
     root = np.sqrt(firm).astype(np.float32)[:, None]
     values = (root * np.array([0.5, 0.5, -1], np.float32)).ravel()
     starts = np.arange(0, values.size + 1, 3, dtype=np.int32)
@@ -207,20 +217,46 @@ def _difference_matrix(variance: Grid, among: Links) -> Any:
 
 def _field_prior(one: Field) -> Any:
     """The second and third sum of one set as a sparse matrix."""
+    return _normal_matrix(_difference_matrix(one.variance, one.among), one.ridge.ravel())
+
+
+def _normal_matrix(differences: Any, ridge: Float[np.ndarray, " n"]) -> Any:
     from scipy.sparse import dia_array
 
-    differences, size = _difference_matrix(one.variance, one.among), one.ridge.size
-    return (differences.T @ differences + dia_array((one.ridge.ravel()[None], 0), shape=(size, size))).tocsr()
+    return (differences.T @ differences + dia_array((ridge[None], 0), shape=(ridge.size, ridge.size))).tocsr()
 
 
 def _map_estimate(one: Field) -> Float[np.ndarray, "h w"]:
+    """The minimum of the sums: of a set of at most WHOLE texels at once, else band by band.
+
+    A band is solved with HALO rows on either side. Texels beyond, at a seam's other end, keep their estimates.
+    """
+    x, (height, width) = one.estimate, one.estimate.shape
+    if x.size <= WHOLE:
+        return x + _change(_field_prior(one), one.error, x, None)
+    result, rows = x.copy(), max(1, BAND // width)
+    for top in range(0, height, rows):
+        own, band = slice(top, min(top + rows, height)), slice(max(top - HALO, 0), min(top + rows + HALO, height))
+        differences = _difference_matrix(one.variance, one.among, band)
+        inside = differences[:, band.start * width : band.stop * width]
+        beyond = inside.T @ (differences @ x.ravel() - inside @ x[band].ravel())
+        change = _change(_normal_matrix(inside, one.ridge[band].ravel()), one.error[band], x[band], beyond)
+        result[own] += change[own.start - band.start :][: own.stop - own.start]
+    return result
+
+
+def _change(
+    prior: Any, error: Grid, estimate: Grid, beyond: Float[np.ndarray, " n"] | None
+) -> Float[np.ndarray, "h w"]:
+    """The change from the estimate, which has smaller rounding errors than the minimum itself; `beyond`: the gradient's
+    part that texels outside the grid give."""
     from scipy.sparse import dia_array
     from scipy.sparse.linalg import cg
 
-    prior = _field_prior(one)
-    sure = (1 / np.maximum(one.error, 1e-4) ** 2).astype(np.float32).ravel()
+    sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32).ravel()
     matrix = prior + dia_array((sure[None], 0), shape=prior.shape)
     inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=prior.shape)
-    # Solves for the change from the estimate, which keeps rounding errors small.
-    change, _ = cg(matrix, -(prior @ one.estimate.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
-    return one.estimate + change.reshape(one.estimate.shape).astype(np.float32)
+    gradient = prior @ estimate.ravel()
+    right = -gradient if beyond is None else -(gradient + beyond)
+    change, _ = cg(matrix, right, rtol=CLOSE, maxiter=STEPS, M=inverse)
+    return change.reshape(estimate.shape).astype(np.float32)

@@ -113,8 +113,9 @@ def diffused(
     diffused weights."""
     right, below = among.right[..., None], among.below[..., None]
     seams = among.seams if np.any(over) else ()
+    part, total = part.copy(), np.empty_like(part)
     for _ in range(steps):
-        total = 2 * part
+        np.multiply(part, 2, out=total)
         total[:, :, :-1] += part[:, :, 1:] * right
         total[:, :, 1:] += part[:, :, :-1] * right
         total[:, :-1] += part[:, 1:] * below
@@ -122,7 +123,8 @@ def diffused(
         flat, sums = (grid.reshape(len(part), -1, part.shape[-1]) for grid in (part, total))
         for seam in seams:
             sums[:, seam.here] += flat[:, seam.there] * (seam.share[:, None] * over)
-        part = total * np.float32(0.2)
+        total *= np.float32(0.2)
+        part, total = total, part
     return part
 
 

@@ -14,6 +14,7 @@ from mistyle.core.mesh import Mesh
 LEAST_VIEWS = 3
 FINE = 0.25  # largest share of texels narrower than ACROSS blocks of averaged pixels
 ACROSS = 2
+MANY = 2**22  # texels beyond which a part of them, at least a quarter of so many, is judged
 LEAST_PIXELS = 32  # along the shorter side of a downsampled picture
 
 
@@ -75,6 +76,8 @@ def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) ->
         for fields in ([t.position for t in texels], [t.normal for t in texels])
     )
     size = np.concatenate([texel_sizes(t)[c.ravel()] for t, c in zip(texels, covered, strict=True)])
+    if len(size) > MANY:
+        position, normal, size = (a[:: len(size) // (MANY // 4)] for a in (position, normal, size))
     result = []
     for camera in cameras:
         px, depth = px_from_world(camera, position)

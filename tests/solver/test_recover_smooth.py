@@ -87,6 +87,22 @@ def test_a_seam_is_a_border_of_tilts_but_not_of_roughness():
     assert np.array_equal(tilt, same)
 
 
+def test_a_large_set_is_solved_in_bands_with_the_same_result(rng: np.random.Generator, monkeypatch):
+    """With holes, unobserved regions and a seam along which both sides lie in every band."""
+    size, column = (400, 48), 20
+    covered = rng.random(size) < 0.97
+    table, error = tables(0.1 * rng.normal(size=size) + waves(400, 90)[:, :48], 0.05)
+    table[:, 5] = 0.5 + rng.normal(0, 0.05, covered.size)
+    error[rng.random(len(error)) < 0.3] = 1.0
+    where = replace(atlas(covered), links=(cut(covered, column),))
+    whole = smoothing.map_smoothing(table, error, where, FLOOR, True)
+    monkeypatch.setattr(smoothing, "WHOLE", 0)
+    monkeypatch.setattr(smoothing, "BAND", 60 * 48)
+    banded = smoothing.map_smoothing(table, error, where, FLOOR, True)
+    moved = np.abs(whole - table).max()
+    assert 0 < np.abs(banded - whole).max() < 2e-3 * moved
+
+
 def test_noise_on_a_smooth_surface_goes(rng: np.random.Generator):
     true, noise = waves(96, 40), 0.03
     table, error = tables(true + rng.normal(0, noise, true.shape), noise)

@@ -5,7 +5,8 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
-from mistyle.solver.schedule import COVERED, SEEN, SHOWN
+from mistyle.process import memory
+from mistyle.solver.schedule import COVERED, LARGE, SEEN, SHOWN, solver_level
 from mistyle.solver.settings import joint_steps
 
 # A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not
@@ -15,13 +16,15 @@ MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
     "pictures": Need(0.53, texel=71, photograph=97),
-    "recover": Need(0.71, texel=900, look=9.6, picture=620),
-    "measure": Need(0.73, texel=300, look=6, picture=620),
-    "asset": Need(0.76, texel=200, look=6, picture=570),
-    "scene": Need(0.76, texel=200, look=6, picture=570),
-    "report": Need(0.74, texel=200, drawn=70, frame=24, look=6, picture=570),
+    "recover": Need(0.71, texel=640, look=9.6, picture=250, view=370),
+    "measure": Need(0.73, texel=300, picture=330),
+    "asset": Need(0.76, texel=200, picture=200),
+    "scene": Need(0.76, texel=200, picture=200),
+    "report": Need(0.74, texel=200, drawn=70, frame=24, picture=200),
 }
 MATERIAL = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in MATERIAL.items()}
+# Bytes of a texel that lie in files where the budget is small.
+IN_FILES = {"pictures": 33, "recover": 150, "measure": 74, "asset": 74, "scene": 74, "report": 74}
 KEEPING = ("recover", "measure", "asset", "scene", "report")
 SAMPLE = 32  # cached bytes per sample of a picture
 # The settings that save memory when halved.
@@ -31,15 +34,14 @@ FITTED = ("atlas.size", "recover.subsamples")
 def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> Counts:
     """The counts of a fit; `pixels` are those of each picture."""
     drawn, frame = shown(settings, sets)
-    texel = solved = sets * settings.atlas.size**2
+    texel, averaged = sets * settings.atlas.size**2, averaged_pixels(settings, pixels)
     # Only covered texels are solved, usually at least half of all.
-    while solved > 2 * settings.recover.solver_texels:
-        solved //= 4
-    looks = 0 if settings.recover.solver == "pictures" else solved * len(pixels)
-    averaged = averaged_pixels(settings, pixels)
+    by = solver_level(settings.recover, texel / 2, len(pixels), soft=False)
+    looks = 0 if settings.recover.solver == "pictures" else texel // by**2 * len(pixels)
+    picture = max(averaged, default=0)
     return Counts(
-        texel, sum(averaged), face=faces, drawn=drawn, frame=frame, look=looks,
-        picture=max(averaged, default=0), photograph=max(pixels, default=0), own=own,
+        texel, picture // by**2 if picture > LARGE else picture, face=faces, drawn=drawn, frame=frame, look=looks,
+        picture=picture, photograph=max(pixels, default=0), own=own,
     )  # fmt: skip
 
 
@@ -56,12 +58,26 @@ def averaged_pixels(settings: Any, pixels: Sequence[int]) -> list[int]:
 def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> float:
     """Peak memory of a fit, GB; `pixels` are those of each picture."""
     count = material_counts(settings, pixels, faces, sets, own)
-    gb_of = peaks(MATERIAL, count)
+    gb_of = peaks(needs_of(settings, pixels, faces, sets, own), count)
     samples = max(settings.recover.subsamples, joint_steps(settings.recover) and settings.recover.joint_subsamples)
-    cached = min(settings.recover.memory, SAMPLE * count.view * samples / 1e9)
+    cached = min(settings.recover.memory, SAMPLE * sum(averaged_pixels(settings, pixels)) * samples / 1e9)
     cached += indirect_gb(settings, pixels)
     gb_of |= {stage: gb_of[stage] + cached for stage in KEEPING}
     return round(max(gb_of.values()), 2)
+
+
+def in_files(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> bool:
+    """Whether texels, the texels' estimate and maps must lie in files for the fit to keep to its budget."""
+    count = material_counts(settings, pixels, faces, sets, own)
+    least = max(peaks(MATERIAL, count).values()) + indirect_gb(settings, pixels)
+    return memory.possible() and least > allowed(settings).gb
+
+
+def needs_of(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> dict[str, Need]:
+    """The stages' needs, with or without arrays in files."""
+    if not in_files(settings, pixels, faces, sets, own):
+        return MATERIAL
+    return {stage: need._replace(texel=need.texel - IN_FILES.get(stage, 0)) for stage, need in MATERIAL.items()}
 
 
 def indirect_gb(settings: Any, pixels: Sequence[int]) -> float:
@@ -79,14 +95,16 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
     A fit leaves out steps for which `recover.memory` is too small. Without `--memory` nothing is reduced: a fit that is
     too large for the machine is refused.
     """
-    budget = allowed(settings)
+    budget, size = allowed(settings), (faces, sets, own)
 
     def least(chosen: Any) -> float:
-        return material_gb(with_setting(chosen, "recover.memory", 1e-9), pixels, faces, sets, own)
+        return material_gb(with_setting(chosen, "recover.memory", 1e-9), pixels, *size)
 
     needed, left = least(settings), float(settings.recover.memory)
     if budget.given:
-        left = budget.gb - max(peaks(MATERIAL, material_counts(settings, pixels, faces, sets, own)).values())
+        left = budget.gb - max(
+            peaks(needs_of(settings, pixels, *size), material_counts(settings, pixels, *size)).values()
+        )
         left -= indirect_gb(settings, pixels)
     elif (whole := material_gb(settings, pixels, faces, sets, own)) > budget.gb >= needed:
         raise UsageError(

@@ -18,7 +18,7 @@ from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
-from mistyle.fitting.pipeline.budget import check_material
+from mistyle.fitting.pipeline.budget import check_material, in_files
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
@@ -29,11 +29,14 @@ from mistyle.fitting.settings.material import MaterialSettings, ReferenceSetting
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs.edits import asset_stage, tell_edits
 from mistyle.jobs.inputs import input_files
-from mistyle.jobs.memory_budget import size_of
+from mistyle.jobs.memory_budget import allowed, size_of
 from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
+from mistyle.process import memory
 from mistyle.solver.photometry.record import Photometry
+
+TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,8 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
     captures = in_working_space(captures, shots, s.colour)
     pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
-    with Run(job, progress, MATERIAL_STAGES) as run:
+    files_at = job.out / "work" if in_files(s, pixels_of(captures)) else None
+    with Run(job, progress, MATERIAL_STAGES) as run, memory.within(1e9 * allowed(s).gb, files_at):
         start_engines(s)
         asset = run.record(
             "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
@@ -326,7 +330,7 @@ def measure(
     converted: list[float] = []
     shown_pictures = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
     for k in range(len(captures)):
-        first = renderer_of(traced, subset(captures, [k]), sizes, chosen)
+        first = renderer_of(traced, subset(captures, [k]), sizes, chosen, TWICE if k in shown_pictures else 0)
         rendered = [first.image_and_coverage(table, 0)]
         if k in shown_pictures:
             rendered.append(first.with_model(second_model).image_and_coverage(table, 0))
@@ -351,10 +355,10 @@ def measure(
     )
 
 
-def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any) -> Any:
-    """The renderer of the one picture of `captures`; it keeps the picture's samples."""
+def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any, memory: float) -> Any:
+    """The renderer of the one picture of `captures`; it keeps at most `memory` bytes of the picture's samples."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
     subsamples = chosen.soft_subsamples if has_soft(captures.lights) else chosen.subsamples
-    options = RenderOptions(chosen.model, chosen.frame, subsamples, gradients=False)
+    options = RenderOptions(chosen.model, chosen.frame, subsamples, memory=memory, gradients=False)
     return MaterialRenderer(traced, captures, sizes, options)

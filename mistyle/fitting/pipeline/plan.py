@@ -4,11 +4,12 @@ from typing import Any
 
 from mistyle.core.light import has_soft
 from mistyle.fitting.pipeline.budget import (
-    MATERIAL,
     averaged_pixels,
     check_material,
+    in_files,
     material_counts,
     material_gb,
+    needs_of,
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.fitting.pipeline.times import closing_stages, recover_seconds
@@ -66,8 +67,8 @@ def plan_material(job: Any) -> dict[str, Any]:
         "megapixels": round(sum(sizes) / 1e6, 1),
         **costs(job, MATERIAL_STAGES, _limited(s, stages), extent.sets),
         "memory_gb": material_gb(chosen, sizes, *size),
-        "in_files": False,
-        "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, *size)),
+        "in_files": in_files(s, sizes, *size),
+        "peaks_gb": peaks(needs_of(s, sizes, *size), material_counts(s, sizes, *size)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + stored) / 1e9, 2),
     }
 

@@ -425,7 +425,9 @@ def _alpha(shot: CapturedPicture, decoded: Picture | None = None) -> Float[np.nd
     """The alpha of the picture (`decoded`, if available), or of the EXR that it replaces."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")
-    if shot.picture.suffix.lower() not in RAW:
+    kind = shot.picture.suffix.lower()
+    # JPEGs and RAW files have none, so they need not be decoded.
+    if decoded is not None or kind not in (".jpg", ".jpeg", *RAW):
         picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded
         if picture.alpha is not None:
             return picture.alpha

@@ -21,6 +21,7 @@ from mistyle.render.deferred.image_samples import SampleBlock, Sampling, Texture
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, TILT
 from mistyle.solver.context import FitContext
 from mistyle.solver.indirect import PALE, enlarged
+from mistyle.solver.smoothing import WHOLE
 from mistyle.solver.table import fill
 from mistyle.solver.texels.observations import covered_rows, points_of
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
 PIXEL, WEIGHT = 240, 8  # bytes of a pixel, and of a bilinear weight
+TEXEL = 750  # bytes of a texel of atlases with more than WHOLE texels, which the budget of a fit leaves out
 LEAST_Z = 0.2  # least z of a mapped normal
 FLASH = (Point((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "camera"),)
 
@@ -59,6 +61,9 @@ def image_footprints(
     and the bytes of memory that remain. None if the memory does not suffice."""
     settings, cameras = context.settings, context.captures.cameras
     left, images, seen = settings.memory * 1e9, dict[int, ImageFootprint](), np.zeros(renderer.texels, bool)
+    left -= TEXEL * max(0, renderer.texels - WHOLE)
+    if left < 0:
+        return None
     for group in by_camera(cameras):
         every = _covered_pixels(context, renderer, cameras[group[0]]) if settings.bounces else None
         for k in group:

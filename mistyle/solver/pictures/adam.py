@@ -140,8 +140,10 @@ class Descent:
             fine = dr.gather(mi.ArrayXf, packed, dr.arange(mi.UInt32, count) + start, shape=(8, count))
             total = None
             for level, shape in enumerate(pyramid):
-                if level:
-                    fine = _halved(fine, pyramid[level - 1], shape)
+                if level == 1:
+                    fine = _halved(packed, start, size, shape)
+                elif level:
+                    fine = _halved(dr.ravel(fine), 0, pyramid[level - 1], shape)
                 new1, new2, new_age, step = self._adam(fine, moments[0][k], moments[1][k], ages[k])
                 first.append(new1)
                 second.append(new2)
@@ -202,13 +204,13 @@ def _levels(size: tuple[int, int], levels: int) -> list[tuple[int, int]]:
     return result
 
 
-def _halved(fine: Any, size: tuple[int, int], half: tuple[int, int]) -> Any:
-    """Sums over 2 x 2 texels."""
+def _halved(packed: Any, start: int, size: tuple[int, int], half: tuple[int, int]) -> Any:
+    """Sums over 2 x 2 texels of the `size` ones from `start` on."""
     import drjit as dr
     import mitsuba
 
     mi: Any = mitsuba
-    packed, count = dr.ravel(fine), half[0] * half[1]
+    count = half[0] * half[1]
     index = dr.arange(mi.UInt32, count)
     row, column = index // half[1], index % half[1]
     total = dr.zeros(mi.ArrayXf, (8, count))
@@ -216,7 +218,7 @@ def _halved(fine: Any, size: tuple[int, int], half: tuple[int, int]) -> Any:
         for dx in (0, 1):
             y, x = 2 * row + dy, 2 * column + dx
             inside = (y < size[0]) & (x < size[1])
-            total += dr.gather(mi.ArrayXf, packed, y * size[1] + x, active=inside, shape=(8, count))
+            total += dr.gather(mi.ArrayXf, packed, y * size[1] + x + start, active=inside, shape=(8, count))
     return total
 
 

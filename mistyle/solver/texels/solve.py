@@ -17,9 +17,10 @@ from mistyle.render.deferred.material_table import METALLIC, SOLVED, MaterialTab
 from mistyle.solver import prior as recover_prior
 from mistyle.solver.context import DirectCaptures, FitContext, Radiance
 from mistyle.solver.journal import Journal
-from mistyle.solver.schedule import SOFT_COST, Pass, rounds_since
+from mistyle.solver.schedule import Pass, rounds_since, solver_level
 from mistyle.solver.table import PRIOR_MEAN, Atlas, Values, linked, scatter, scatter_to_atlas
 from mistyle.solver.texels import rounds as recover_solve
+from mistyle.solver.texels.level_pictures import level_captures
 from mistyle.solver.texels.levenberg_marquardt import Options, Problem, Solution
 from mistyle.solver.texels.observations import (
     ObservationOptions,
@@ -79,25 +80,28 @@ def texel_level(
     progress: Callable[[float], None],
 ) -> TexelLevel:
     """The level with its observations; `renderer` gives that of the atlas."""
-    by, settings, sizes = 1, context.settings, context.atlas.sizes
-    sides = [side for size in sizes for side in size]
-    most = settings.solver_texels / (SOFT_COST if has_soft(context.captures.lights) else 1)
-    while settings.solver != "pictures" and sum(int(c.sum()) for c in context.atlas.covered) / by**2 > most:
-        if any(side % (2 * by) or side // (2 * by) < 8 for side in sides):
-            break
-        by *= 2
+    sizes, soft = context.atlas.sizes, has_soft(context.captures.lights)
+    covered = sum(int(c.sum()) for c in context.atlas.covered)
+    by = solver_level(context.settings, covered, len(context.captures), soft)
+    while by > 1 and any(side % by or side // by < 8 for size in sizes for side in size):
+        by //= 2
     if by == 1:
         return _level(context, renderer(), 1, start, progress)
     mesh = context.traced.mesh
     texels = [rasterise(mesh, p, size[0] // by) for p, size in enumerate(sizes)]
-    coarse = replace(context, texels=texels, atlas=linked(mesh, texels))
+    averaged, left = level_captures(texels, context.captures, 1e9 * context.settings.memory)
+    coarse = replace(
+        context, texels=texels, atlas=linked(mesh, texels), captures=averaged, cameras=context.captures.cameras
+    )
     if start is not None:
         start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
-    note = f"The per-texel solver ran on a level {by} times coarser than the atlas."
+    note = (
+        f"The per-texel solver ran on a level {by} times coarser than the atlas (recover.solver_texels); finer detail "
+        "comes from the passes on whole pictures alone."
+    )
     context.notes.extend([note] * (note not in context.notes))
     # Its texels are larger than pixels, and samples under soft light are slow.
-    subsamples = 1 if has_soft(context.captures.lights) else None
-    return _level(coarse, coarse.renderer(subsamples), by, start, progress)
+    return _level(coarse, coarse.renderer(1 if soft else None, left), by, start, progress)
 
 
 def _level(
@@ -152,8 +156,9 @@ def solution_after_rounds(
     The solver restarts with each estimate: indirect light can shift roughness and metallic into a local minimum, where
     they would stay otherwise.
     """
-    (solution, direct), context, problem, atlas = start, level.context, level.problem, level.context.atlas
+    (solution, whole), context, problem, atlas = start, level.context, level.problem, level.context.atlas
     assert problem is not None
+    direct = replace(whole, captures=context.captures)
     if one.samples:
         table = scatter_to_atlas(solution.values, level.observed, atlas)
         sampling = one.samples, context.seed + one.begin
@@ -181,7 +186,7 @@ def solution_after_rounds(
         rms.append(float(arrays.pop("rms")))
         solution = Solution(**arrays)
         progress(0.7 + 0.3 * (number + 1 - one.begin) / one.steps)
-    return solution, direct
+    return solution, replace(whole, indirect=direct.indirect)
 
 
 def estimate_of(level: TexelLevel, solution: Solution | None, context: FitContext) -> TexelEstimate:
@@ -271,8 +276,8 @@ def _on_atlas(
         scatter(std, observed, atlas, np.array(recover_prior.PRIOR_SPREAD, np.float32)),
         scatter(data_weight, observed, atlas, 1),
         scatter(unconstrained, observed, atlas, recover_prior.NOTHING),
-        scatter(observed.seen, observed, atlas, 0),
-        scatter(observed.views, observed, atlas, 0),
+        scatter(observed.seen.astype(np.int32), observed, atlas, 0),
+        scatter(observed.views.astype(np.int32), observed, atlas, 0),
         solved,
     )
 
@@ -300,7 +305,7 @@ def estimate_indirect(
         if all(k in skip for k in group):
             continue
         many = [captures.lights[k] for k in group]
-        request = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
+        request = (context.cameras or captures.cameras)[group[0]], many, samples, seed + len(captures) * group[0]
         lights: list[tuple[np.ndarray, Any]]
         lights = (
             scene.pictures_and_vectors(*request) if vectors else [(light, None) for light in scene.pictures(*request)]
