@@ -106,6 +106,11 @@ class Reached:
         estimate = self.work.estimate(self.state, smooth)
         return _maps(self.work.context, estimate, estimate.table if self.state.table is None else self.state.table)
 
+    def finished(self) -> tuple[Maps, ...]:
+        """The maps of a recovery with as many passes: slower than `maps`."""
+        table, estimate = self.work.result(self.state)
+        return _maps(self.work.context, estimate, table)
+
 
 @dataclass(frozen=True)
 class Limits:
