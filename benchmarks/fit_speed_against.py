@@ -7,8 +7,8 @@ are those of `material_recovery`: `normal` (mean, degrees), `roughness` (MSE), `
     ratio.time_to_figures   seconds until our maps have the four figures of the other commit's end, at the precision of
                             the tables (two digits, 0.1 dB), over its seconds; the larger of both assets. After each
                             pass our maps are finished as `--passes N` finishes them, and the first that suffice count
-    ratio.draft             seconds of a whole draft (`--preset draft`) over those of the other commit's fit
-    NAME.…                  both sides' figures and seconds; `….draft.reached` is 1 where the draft has 1°, 1e-2, 33 dB
+    ratio.draft             the same for a draft (`--preset draft`) until it has 1°, 1e-2 and 33 dB
+    NAME.…                  both sides' figures and seconds, there; `….whole_seconds` are those of the whole fit
     ….cpu                   the same of processor time
 
 A ratio is NEVER where the figures are not reached.
@@ -18,7 +18,7 @@ import json
 import subprocess
 import sys
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
@@ -101,21 +101,29 @@ def compared(case: Case, there: Tree, here: Tree, scratch: Path) -> dict[str, fl
     (end,) = fit(case, there, scratch / f"{case.name}-there", {}, stops=False)
     theirs = four(case, end)
     result = told(f"{case.name}.there", end, theirs)
-    ours, reached, values = fit(case, here, scratch / f"{case.name}-here", {}, stops=True), None, theirs
-    for stop in ours:
-        values = four(case, stop, theirs)
-        if as_good(values, theirs):
+    ours = fit(case, here, scratch / f"{case.name}-here", {}, stops=True)
+    result |= until(case, "here", "time_to_figures_ratio", ours, (theirs, end))
+    settings, wanted = MATERIAL_PRESETS["draft"]["recover"], {n: b for n, (_, _, b) in FIGURES.items() if b is not None}
+    drafts = fit(case, here, scratch / f"{case.name}-draft", dict(settings), stops=True)
+    return result | until(case, "draft", "draft_ratio", drafts, (wanted, end))
+
+
+def until(
+    case: Case, side: str, ratio: str, stops: Sequence[Stop], goal: tuple[Mapping[str, float], Stop]
+) -> dict[str, float]:
+    """The first stop with the wanted figures, else the last: its figures, and its seconds over those of the other
+    side's end; `goal` is both."""
+    wanted, end = goal
+    reached, values = None, {}
+    for stop in stops:
+        values = four(case, stop, wanted)
+        if as_good(values, wanted):
             reached = stop
             break
-    result |= told(f"{case.name}.here", reached or ours[-1], values)
-    result |= {f"{case.name}.here.passes": (reached or ours[-1]).passes}
-    result |= {f"{case.name}.here.whole_seconds": ours[-1].wall, f"{case.name}.here.whole_seconds.cpu": ours[-1].cpu}
-    result |= ratios(f"{case.name}.time_to_figures_ratio", reached, end)
-    (draft,) = fit(case, here, scratch / f"{case.name}-draft", dict(MATERIAL_PRESETS["draft"]["recover"]), stops=False)
-    values = four(case, draft)
-    wanted = {name: bound for name, (_, _, bound) in FIGURES.items() if bound is not None}
-    result |= told(f"{case.name}.draft", draft, values) | {f"{case.name}.draft.reached": as_good(values, wanted)}
-    return result | ratios(f"{case.name}.draft_ratio", draft if as_good(values, wanted) else None, end)
+    shown, whole = reached or stops[-1], stops[-1]
+    result = told(f"{case.name}.{side}", shown, values) | {f"{case.name}.{side}.passes": shown.passes}
+    result |= {f"{case.name}.{side}.whole_seconds": whole.wall, f"{case.name}.{side}.whole_seconds.cpu": whole.cpu}
+    return result | ratios(f"{case.name}.{ratio}", reached, end)
 
 
 def fit(case: Case, tree: Tree, out: Path, settings: Mapping[str, Any], stops: bool) -> list[Stop]:

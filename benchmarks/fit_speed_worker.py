@@ -28,9 +28,9 @@ def main() -> None:
     known = truth(Path(request["file"]), request["name"], cameras[0], request["uv"], True)
     shots, pictures = drawing.one_at_a_time(cameras), list(np.load(request["pictures"]))
     stops = Stops(out)
-    more = {"limits": stops.limits()} if request["stops"] else {}
+    chosen = request["settings"] | ({"limits": stops.limits()} if request["stops"] else {})
     stops.begin()
-    fitted = ours(known, shots, pictures, "mikkt", **request["settings"], **more)
+    fitted = ours(known, shots, pictures, "mikkt", **chosen)
     stops.end(fitted.maps)
     result = {"inputs": inputs_hash(known), "stops": stops.rows}
     (out / "stops.json").write_text(json.dumps(result))

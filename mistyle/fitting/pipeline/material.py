@@ -20,6 +20,7 @@ from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import scene, write
+from mistyle.fitting.pipeline.first_look import first_asset
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
@@ -114,12 +115,13 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
+        fitted, _ = hold_out(whole, s.references)
+        first_asset(run, asset, texels, subset(whole, fitted))
         whole, photometry = match_exposures(run, asset, whole, shots)
         captures, notes = average_pictures(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *notes))
         if job.lights == "unknown":
             captures = with_light(run, asset, captures)
-        fitted, _ = hold_out(captures, s.references)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
         recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
