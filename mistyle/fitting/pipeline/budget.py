@@ -6,7 +6,7 @@ from typing import Any
 from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
 from mistyle.solver.schedule import COVERED, SEEN, SHOWN
-from mistyle.solver.settings import joint_steps
+from mistyle.solver.settings import DETAILED, joint_steps
 
 # A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not
 # regain completely after the stage. Measured by `fit_512` and `fit_200` of `python -m benchmarks.photographs`, the
@@ -36,6 +36,8 @@ def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: 
     while solved > 2 * settings.recover.solver_texels:
         solved //= 4
     looks = 0 if settings.recover.solver == "pictures" else solved * len(pixels)
+    if looks and settings.recover.detail:
+        looks = max(looks, min(texel * len(pixels), 2 * DETAILED))
     averaged = averaged_pixels(settings, pixels)
     return Counts(
         texel, sum(averaged), face=faces, drawn=drawn, frame=frame, look=looks,

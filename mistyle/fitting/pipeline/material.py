@@ -35,6 +35,7 @@ from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
 from mistyle.solver.photometry.record import Photometry
+from mistyle.solver.settings import measured_subsamples
 
 
 @dataclass(frozen=True)
@@ -357,6 +358,6 @@ def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any) -> Any
     """The renderer of the one picture of `captures`; it keeps the picture's samples."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
-    subsamples = chosen.soft_subsamples if has_soft(captures.lights) else chosen.subsamples
-    options = RenderOptions(chosen.model, chosen.frame, subsamples, gradients=False)
+    subsamples = measured_subsamples(chosen, has_soft(captures.lights))
+    options = RenderOptions(chosen.model, chosen.frame, subsamples, directions=chosen.soft_measured, gradients=False)
     return MaterialRenderer(traced, captures, sizes, options)

@@ -79,13 +79,7 @@ def texel_level(
     progress: Callable[[float], None],
 ) -> TexelLevel:
     """The level with its observations; `renderer` gives that of the atlas."""
-    by, settings, sizes = 1, context.settings, context.atlas.sizes
-    sides = [side for size in sizes for side in size]
-    most = settings.solver_texels / (SOFT_COST if has_soft(context.captures.lights) else 1)
-    while settings.solver != "pictures" and sum(int(c.sum()) for c in context.atlas.covered) / by**2 > most:
-        if any(side % (2 * by) or side // (2 * by) < 8 for side in sides):
-            break
-        by *= 2
+    by, sizes = level_factor(context), context.atlas.sizes
     if by == 1:
         return _level(context, renderer(), 1, start, progress)
     mesh = context.traced.mesh
@@ -98,6 +92,18 @@ def texel_level(
     # Its texels are larger than pixels, and samples under soft light are slow.
     subsamples = 1 if has_soft(context.captures.lights) else None
     return _level(coarse, coarse.renderer(subsamples), by, start, progress)
+
+
+def level_factor(context: FitContext) -> int:
+    """The ratio of the atlas's side to that of the level."""
+    by, settings, sizes = 1, context.settings, context.atlas.sizes
+    sides = [side for size in sizes for side in size]
+    most = settings.solver_texels / (SOFT_COST if has_soft(context.captures.lights) else 1)
+    while settings.solver != "pictures" and sum(int(c.sum()) for c in context.atlas.covered) / by**2 > most:
+        if any(side % (2 * by) or side // (2 * by) < 8 for side in sides):
+            break
+        by *= 2
+    return by
 
 
 def _level(
