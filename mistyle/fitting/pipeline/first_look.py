@@ -39,7 +39,7 @@ def first_asset(run: Run, asset: Asset, texels: Sequence[Texels], captures: Capt
         if any(m.known.any() for m in maps):
             sets = list(zip(texels, maps, strict=True))
             key = digest([run.base, "first look"])
-            run.preliminary("asset", key, lambda folder: write(folder, job, asset, sets, state=STATE), {"passes": 0})
+            run.preliminary("asset", key, lambda folder: write(folder, job, asset, sets, state=STATE), {"first": True})
 
 
 def first_look(asset: Asset, texels: Sequence[Texels], captures: Captures) -> tuple[Maps, ...]:
