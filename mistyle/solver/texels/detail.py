@@ -19,12 +19,8 @@ from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.settings import DETAILED
 from mistyle.solver.table import fill
 from mistyle.solver.texels.levenberg_marquardt import Options, Problem
-from mistyle.solver.texels.observations import (
-    ObservationOptions,
-    TexelObservations,
-    collect_observations,
-    sample_image,
-)
+from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, collect_observations
+from mistyle.solver.texels.solve import observed_direct
 
 DIMMEST = 0.02  # of the median of `linear`: observations that reflect less give no albedo
 
@@ -81,22 +77,13 @@ def _write_albedo(table: MaterialTable, band: Observed, direct: DirectCaptures) 
     constant, linear = band.problem.predict(black), band.problem.predict(white)
     linear -= constant
     count = len(linear)
-    rgb = _radiance(observed, direct)[:count] - constant
+    rgb = observed_direct(observed, direct).observations.rgb[:count] - constant
     texel = np.repeat(np.arange(len(observed.texel)), observed.seen)[:count]
     for c in range(3):
         bright = np.flatnonzero(linear[:, c] > DIMMEST * np.median(linear[:, c]))
         ratio = np.clip(rgb[bright, c] / linear[bright, c], 0, 1)
         rows, median = weighted_medians(texel[bright], ratio, linear[bright, c])
         table[observed.texel[rows], c] = median
-
-
-def _radiance(observed: TexelObservations, direct: DirectCaptures) -> Float[np.ndarray, "o 3"]:
-    """The observations without indirect light."""
-    rgb = observed.observations.rgb.copy()
-    for k in direct.indirect:
-        samples = observed.per_image[k]
-        rgb[samples.rows] = sample_image(np.nan_to_num(direct.load(k)[0]), samples)
-    return rgb
 
 
 def weighted_medians(

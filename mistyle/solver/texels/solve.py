@@ -165,7 +165,7 @@ def solution_after_rounds(
         sampling = one.samples, context.seed + one.begin
         for k, light, _ in journalled_light(context, level.renderer, table, sampling, journal, progress.part(0, 0.4)):
             direct = direct.with_indirect(k, light)
-    observed = _observed_direct(level.observed, direct) if direct.indirect else level.observed
+    observed = observed_direct(level.observed, direct) if direct.indirect else level.observed
     if one.samples:
         problem.reweight(observed.observations.weight)
         problem.retarget(observed.observations.rgb)
@@ -335,7 +335,7 @@ def journalled_light(
         yield k, journal.part(f"light.{k}", lambda light=light: {"light": light})["light"], None
 
 
-def _observed_direct(observed: TexelObservations, direct: DirectCaptures) -> TexelObservations:
+def observed_direct(observed: TexelObservations, direct: DirectCaptures) -> TexelObservations:
     """The observations without indirect light, whose uncertainty reduces their weights."""
     rgb, weight = observed.observations.rgb.copy(), observed.observations.weight.copy()
     for k, samples in enumerate(observed.per_image):
