@@ -3,7 +3,9 @@
 `castle`: eleven JPEGs of a façade (MISTYLE_DATA/photographs/castle) with a COLMAP model, a mesh in another frame, sky,
 trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out 2 --preset draft`:
 
-    castle.seconds, castle.plan_ratio   of the fit, and over the seconds of --dry-run
+    castle.seconds, castle.cpu_seconds  of the fit, and of its processor
+    castle.plan_ratio                   its seconds over those of --dry-run
+    castle.first_asset                  share of its seconds after which `asset` existed
     castle.exposure_r                   correlation of log exposures, solved without EXIF, with its log shutter times
     castle.psnr_held_out                of the held-out pictures (sRGB, peak 1, valid pixels of the mesh)
     castle.psnr_held_out_texture        the same for the fitted pictures projected as an unlit texture: each texel's
@@ -19,6 +21,8 @@ trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out
 `metals`: DamagedHelmet and WaterBottle with their own maps, 16 views of 256² x an environment in three positions, as
 `benchmarks.material_recovery --maps own_soft` draws and fits them; of both the worse: `metals.metallic_right` (share of
 the surface that three cameras see), `metals.albedo_psnr` and `calibration.worst` (from 0.683, over all maps).
+
+`--only plan`: plan against time of five jobs (`captures_plan.py`).
 
 --quick fits textures of 256², texel by texel alone; the phone's pictures have 160 pixels a side,
 the metals' 96.
@@ -38,15 +42,17 @@ from jaxtyping import Float
 
 from benchmarks import material_recovery as recovery
 from benchmarks import recovery_pictures as drawing
+from benchmarks.captures_plan import plans, watched
 from benchmarks.common import finish, parser, run_mistyle
 from benchmarks.material_metrics import align_channels, map_errors, orb_mask, psnr_ldr
 from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, seen, truth
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import pixel_centres
 from mistyle.core.capture import Captures, subset
-from mistyle.core.image import bilinear, luminance, srgb_from_linear
-from mistyle.core.light import Ambient, Environment, environment_directions
+from mistyle.core.image import bilinear, luminance, nearest_fill, srgb_from_linear
+from mistyle.core.light import Environment, environment_directions
 from mistyle.core.maps import Texels
+from mistyle.fitting.pipeline.first_look import median_textures
 from mistyle.fitting.pipeline.photometry import exif_exposure
 from mistyle.fitting.pipeline.pictures import read_averaged
 from mistyle.io.cameras.camera_files import transforms
@@ -59,7 +65,6 @@ from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
 from mistyle.solver.photometry.record import coordinates, corrected, fall_terms
 from mistyle.solver.photometry.solve import solve_photometry
 from mistyle.solver.texels.gbuffer import open_sky
-from mistyle.solver.texels.observations import ObservationOptions, collect_observations
 
 QUICK = ["--atlas", 256, "--set", "recover.solver=texels", "--set", "recover.bounces=0"]
 STEP = 3  # texels between the two of a pair
@@ -82,9 +87,8 @@ class CastleRun:
 
 def main() -> None:
     options = parser(__doc__ or "")
-    options.add_argument(
-        "--only", choices=("castle", "phone", "metals"), action="append", help="only this part (repeatable)"
-    )
+    parts = ("castle", "phone", "metals", "plan")
+    options.add_argument("--only", choices=parts, action="append", help="only this part (repeatable)")
     options.add_argument("--keep", type=Path, help="folder for the runs, to look at afterwards")
     chosen = options.parse_args()
     figures: dict[str, float] = {}
@@ -96,6 +100,8 @@ def main() -> None:
             figures |= phone(place / "phone", chosen.quick)
         if "metals" in (chosen.only or ["metals"]):
             figures |= metals(place / "metals", chosen.quick)
+        if "plan" in (chosen.only or []):
+            figures |= plans(place / "plan", chosen.quick)
     finish(figures, chosen.json)
 
 
@@ -105,13 +111,13 @@ def castle(out: Path, quick: bool) -> dict[str, float]:
     words = ["fit", folder / "scene_mesh.ply", folder, "-o", out, "--align", "--light", "unknown", "--hold-out", 2]
     words += ["--preset", "draft", *(QUICK if quick else [])]
     plan = run_mistyle(*words, "--dry-run")
-    start = time.perf_counter()
-    summary = run_mistyle(*words)
-    figures = {"castle.seconds": time.perf_counter() - start}
-    figures["castle.plan_ratio"] = figures["castle.seconds"] / plan["seconds"]
+    ran = watched(words, out)
+    figures = {"castle.seconds": ran.seconds, "castle.cpu_seconds": ran.cpu}
+    figures["castle.plan_ratio"] = ran.seconds / plan["seconds"]
+    figures["castle.first_asset"] = ran.first_asset / ran.seconds
     run = castle_run(folder, out)
     figures["castle.exposure_r"] = exposure_r(folder, run)
-    figures["castle.psnr_held_out"] = summary["figures"]["psnr_held_out"]
+    figures["castle.psnr_held_out"] = ran.summary["figures"]["psnr_held_out"]
     figures["castle.psnr_held_out_texture"] = texture_psnr(run)
     steps = shadow_steps(run)
     figures["castle.shadow_step_ratio"], figures["castle.shadow_pairs"] = steps
@@ -151,26 +157,9 @@ def _unaveraged(folder: Path, run: CastleRun) -> tuple[Any, ...]:
 def texture_psnr(run: CastleRun) -> float:
     """Mean PSNR of the held-out pictures, predicted by the median of the others as an unlit texture."""
     fitted = [k for k in range(len(run.captures)) if k not in run.held]
-    chosen = subset(run.captures, fitted)
-    lit = replace(chosen, lights=((Ambient((1.0, 1.0, 1.0)),),) * len(fitted))
-    observed = collect_observations(run.traced, [run.texels], lit, None, ObservationOptions(skies=False))
-    texture = np.zeros((*run.texels.covered.shape, 3), np.float32)
-    values, start = observed.observations.rgb, observed.observations.start
-    rows = np.array([
-        np.median(values[low:high], axis=0) if high > low else np.zeros(3)
-        for low, high in zip(start[:-1], start[1:], strict=True)
-    ])  # fmt: skip
-    texture.reshape(-1, 3)[observed.texel] = rows
-    known = np.zeros(run.texels.covered.shape, bool)
-    known.ravel()[observed.texel] = np.diff(start) > 0
-    texture = _filled(texture, known)
+    ((texture, known),) = median_textures(run.traced, [run.texels], subset(run.captures, fitted))
+    texture = nearest_fill(texture, known)
     return float(np.mean([_texture_error(run, texture, k) for k in run.held]))
-
-
-def _filled(texture: np.ndarray, known: np.ndarray) -> np.ndarray:
-    from mistyle.core.image import nearest_fill
-
-    return nearest_fill(texture, known)
 
 
 def _texture_error(run: CastleRun, texture: Float[np.ndarray, "h w 3"], k: int) -> float:

@@ -14,6 +14,8 @@ exponent_views/…          slope of log(seconds) over log(views, pixels of a vi
 lm_texels_per_second      of the per-texel solver; …_differences with a Jacobian by finite differences, …_1_thread
 time_to_quality_ratio     our time to the naive loop's final relighting PSNR / that loop's (not with --quick)
 …floor_ratio              our seconds / the time it takes only to move the bytes that any such step must read and write
+
+`--against COMMIT` instead compares whole fits with that commit's: `fit_speed_against.py`.
 """
 
 import argparse
@@ -388,8 +390,14 @@ def main(argv: list[str] | None = None) -> None:
     own = argparse.ArgumentParser(add_help=False)
     own.add_argument("--mesh", type=Path, default=DATA / MESH)
     own.add_argument("--skip", nargs="+", default=[], choices=[m.__name__ for m in MEASUREMENTS])
+    own.add_argument("--against", metavar="COMMIT", help="compare whole fits with those of this commit")
     chosen, rest = own.parse_known_args(argv)
     options = arguments(__doc__ or "", rest)
+    if chosen.against:
+        from benchmarks.fit_speed_against import against
+
+        finish(against(chosen.against, options.quick), options.json)
+        return
     from mistyle.io.read_mesh import read_mesh
 
     mesh = read_mesh(chosen.mesh).mesh

@@ -13,7 +13,7 @@ from mistyle.core.capture import in_memory
 from mistyle.core.maps import Maps
 from mistyle.fitting.light.unknown_light import find_light
 from mistyle.render.mitsuba.scene import Frame
-from mistyle.solver.recover import recover
+from mistyle.solver.recover import NO_LIMITS, Limits, recover
 from mistyle.solver.settings import RecoverSettings
 
 
@@ -37,6 +37,7 @@ def ours(
     seed: int = 0,
     *,
     unknown: bool = False,
+    limits: Limits = NO_LIMITS,
     **chosen: Any,
 ) -> Fitted:
     """Fit from scratch, metallic unknown, default settings but for `chosen`. The truth lends mesh and atlas only; the
@@ -51,5 +52,5 @@ def ours(
     if unknown:
         light = find_light(known.mesh, captures, settings).light
         captures = replace(captures, lights=tuple((light,) for _ in cameras))
-    found = recover(known.mesh, known.texels, captures, settings, seed)
+    found = recover(known.mesh, known.texels, captures, settings, seed, limits=limits)
     return Fitted(found.maps, found.confidence, found.spread, time.perf_counter() - start, found.notes)

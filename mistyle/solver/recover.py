@@ -37,11 +37,13 @@ from mistyle.solver.schedule import FILLED, Pass, Size, schedule, shares, size_f
 from mistyle.solver.settings import RecoverSettings, descent_steps
 from mistyle.solver.smoothing import map_smoothing
 from mistyle.solver.table import atlas_of, linked
+from mistyle.solver.texels.detail import Detail
 from mistyle.solver.texels.solve import (
     TexelEstimate,
     TexelLevel,
     estimate_of,
     first_solution,
+    level_factor,
     solution_after_rounds,
     texel_level,
 )
@@ -105,7 +107,13 @@ class Reached:
         """The maps so far; those of passes on whole pictures are not smoothed, and none without `smooth`, to be
         quick."""
         estimate = self.work.estimate(self.state, smooth)
-        return _maps(self.work.context, estimate, estimate.table if self.state.table is None else self.state.table)
+        table = estimate.table if self.state.table is None else self.state.table
+        return _maps(self.work.context, estimate, self.work.detailed(self.state, table) if smooth else table)
+
+    def finished(self) -> tuple[Maps, ...]:
+        """The maps of a recovery with as many passes: slower than `maps`."""
+        table, estimate = self.work.result(self.state)
+        return _maps(self.work.context, estimate, table)
 
 
 @dataclass(frozen=True)
@@ -182,6 +190,7 @@ class _Work:
         self._level: TexelLevel | None = None
         self._renderer: MaterialRenderer | None = None
         self._joint: JointSetup | None = None
+        self._detail: Detail | None = None
         self._targets: DirectCaptures | None = None
         self._estimates: tuple[PassState, TexelEstimate] | None = None
 
@@ -223,6 +232,19 @@ class _Work:
         return state, len(planned)
 
     def result(self, state: PassState) -> tuple[MaterialTable, TexelEstimate]:
+        """The final table of a state, smoothed and with its detail, and the texels' estimate."""
+        table, estimate = self.smoothed(state)
+        return self.detailed(state, table), estimate
+
+    def detailed(self, state: PassState, table: MaterialTable) -> MaterialTable:
+        """The table with the albedo's detail, where the texels were solved on a coarser level."""
+        settings = self.context.settings
+        if not settings.detail or settings.solver == "pictures" or level_factor(self.context) == 1:
+            return table
+        self._detail = self._detail or Detail(self.context)
+        return self._detail(table, state.direct)
+
+    def smoothed(self, state: PassState) -> tuple[MaterialTable, TexelEstimate]:
         """The final table of a state, smoothed, and the texels' estimate."""
         estimate, settings = self.estimate(state), self.context.settings
         if state.table is None:
@@ -301,7 +323,7 @@ class _Work:
             return state
         if one.kind == "joint":
             return state if state.over else self._joint_pass(state, one, progress)
-        table = self.result(state)[0]
+        table = self.smoothed(state)[0]
         return replace(state, table=polished(context, table, progress), settled=True)
 
     def _joint_pass(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:

@@ -15,6 +15,7 @@ from mistyle.solver.settings import (
     descent_steps,
     estimates,
     joint_estimates,
+    measured_subsamples,
     passes,
 )
 
@@ -41,6 +42,7 @@ PER_VISIBILITY = 1.3e-8  # a sample and a cell, once
 PER_PATH, PER_SOFT_PATH = 1.2e-7, 3e-7  # a path of indirect light
 PER_SMOOTHED = 1.5e-5  # a covered texel in one smoothing pass
 PER_JOINT = 3e-6  # a sample in a joint step
+PER_DETAIL = 4e-6  # a covered texel in a picture, for the albedo's detail
 
 
 @dataclass(frozen=True)
@@ -137,17 +139,17 @@ def collecting_seconds(settings: RecoverSettings, size: Size) -> float:
 
 
 def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool, shown: float = SHOWN) -> float:
-    """Seconds of rendering every picture once, with all cells of soft light."""
-    cells = SKY_CELLS * (PER_SAMPLE_CELL + PER_VISIBILITY) if soft else 0
-    subsamples = settings.soft_subsamples if soft else settings.subsamples
-    return shown * sum(pixels) * subsamples * (PER_COLLECTED + cells)
+    """Seconds of rendering every picture once, to measure the fit."""
+    cells = settings.soft_measured * (PER_SAMPLE_CELL + PER_VISIBILITY) if soft else 0
+    return shown * sum(pixels) * measured_subsamples(settings, soft) * (PER_COLLECTED + cells)
 
 
 def finishing_seconds(settings: RecoverSettings, size: Size) -> float:
-    """Seconds after the last pass: the loss before and after, smoothing, and the residual of every picture."""
+    """Seconds after the last pass: the loss before and after, smoothing, detail, and the residual of every picture."""
+    detail = settings.detail * size.pictures * size.texels * (PER_DETAIL if size.cells else PER_DETAIL / 4)
     judged = min(1.0, JUDGES / size.pictures) if descent_steps(settings) else 0
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
-    return (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + smoothing
+    return (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + smoothing + detail
 
 
 def _rendering(settings: RecoverSettings, size: Size) -> float:

@@ -8,6 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 SETTLING = 3
 FEWER = 8  # factor of fewer samples for provisional estimates of indirect light
 PASSES = 8  # most passes over the pictures, the last twice as long
+DETAILED = 20_000_000  # most texels times pictures that are observed at once for the albedo's detail
+LEAST_MEASURED = 4
 SWEEPS = 2  # least epochs of a pass; fewer steps give fewer passes
 
 
@@ -62,6 +64,11 @@ class RecoverSettings(BaseModel):
         description="Empirical-Bayes smoothing of albedo, tilt and roughness; its strength is estimated locally and "
         "grows with their uncertainty; a sharp edge that few pictures show is rounded",
     )
+    detail: bool = Field(
+        default=False,
+        description="where the per-texel solver ran on a level coarser than the atlas: take the albedo's detail from "
+        "the pictures, divided by the fitted shading",
+    )
     noise: float = Field(
         default=0.0005,
         gt=0,
@@ -98,6 +105,12 @@ class RecoverSettings(BaseModel):
         ge=8,
         le=512,
         description="cells of such light in a sample; samples see different parts of each, so their mean has more",
+    )
+    soft_bounces: int = Field(
+        default=8, ge=0, le=8, description="most estimates of indirect light under environments and ambient light"
+    )
+    soft_measured: int = Field(
+        default=128, ge=8, le=512, description="cells of such light in the pictures that measure the fit"
     )
     roughness_floor: float = Field(
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
@@ -150,6 +163,16 @@ class RecoverSettings(BaseModel):
         if isqrt(value) ** 2 != value:
             raise ValueError("expected a square number: 1, 4, 9, 16, 25, …")
         return value
+
+
+def under_soft_light(settings: RecoverSettings) -> RecoverSettings:
+    """The settings under soft light: without joint steps, which would be slow, and within `soft_bounces`."""
+    return settings.model_copy(update={"joint": 0, "bounces": min(settings.bounces, settings.soft_bounces)})
+
+
+def measured_subsamples(settings: RecoverSettings, soft: bool) -> int:
+    """Samples a pixel of the pictures that measure a fit: at least LEAST_MEASURED, so that edges are averaged."""
+    return max(settings.soft_subsamples, LEAST_MEASURED) if soft else settings.subsamples
 
 
 def descent_steps(settings: RecoverSettings) -> int:

@@ -10,8 +10,9 @@ from test_material import SIDE, SIZE, bowl, one_by_one, orbit
 import mistyle
 from mistyle.cli.main import main
 from mistyle.core.errors import Stopped
-from mistyle.fitting.pipeline import passes
+from mistyle.fitting.pipeline import material, passes
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs import progress as jobs_progress
 from mistyle.process import stopping
@@ -78,6 +79,22 @@ def test_a_stop_request_writes_the_asset_so_far(shots, whole, tmp_path, monkeypa
     summary = fit(shots, tmp_path)
     assert hashes(tmp_path) == whole and summary["passes"]["done"] == summary["passes"]["planned"]
     assert not any("set aside" in note for note in summary["notes"])
+
+
+def test_an_asset_of_the_pictures_exists_before_the_first_pass(shots, tmp_path, monkeypatch):
+    def stopped(*_):
+        raise Stopped("stopped before the first pass")
+
+    monkeypatch.setattr(material, "recovered_maps", stopped)
+    with pytest.raises(Stopped):
+        fit(shots, tmp_path)
+    marker, albedo = tmp_path / "asset" / "done.json", tmp_path / "asset" / "textures" / "bowl_albedo.png"
+    assert json.loads(marker.read_text())["first"] is True and (tmp_path / "asset" / "bowl.glb").is_file()
+    assert read_picture(albedo, "stored").rgb.std() > 0.02
+    written = marker.stat().st_mtime_ns
+    with pytest.raises(Stopped):
+        fit(shots, tmp_path)
+    assert marker.stat().st_mtime_ns == written
 
 
 def test_the_command_line_takes_both_limits(shots, tmp_path, capsys):

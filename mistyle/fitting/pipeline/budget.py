@@ -7,7 +7,7 @@ from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
 from mistyle.process import memory
 from mistyle.solver.schedule import COVERED, LARGE, SEEN, SHOWN, solver_level
-from mistyle.solver.settings import joint_steps
+from mistyle.solver.settings import DETAILED, joint_steps
 
 # A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not
 # regain completely after the stage. Measured by `fit_512` and `fit_200` of `python -m benchmarks.photographs`, the
@@ -38,6 +38,8 @@ def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: 
     # Only covered texels are solved, usually at least half of all.
     by = solver_level(settings.recover, texel / 2, len(pixels), soft=False)
     looks = 0 if settings.recover.solver == "pictures" else texel // by**2 * len(pixels)
+    if looks and settings.recover.detail:
+        looks = max(looks, min(texel * len(pixels), 2 * DETAILED))
     picture = max(averaged, default=0)
     return Counts(
         texel, picture // by**2 if picture > LARGE else picture, face=faces, drawn=drawn, frame=frame, look=looks,

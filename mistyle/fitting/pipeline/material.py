@@ -20,6 +20,7 @@ from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.fitting.pipeline.budget import check_material, in_files
 from mistyle.fitting.pipeline.files import scene, write
+from mistyle.fitting.pipeline.first_look import first_asset
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
@@ -35,6 +36,7 @@ from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
 from mistyle.process import memory
 from mistyle.solver.photometry.record import Photometry
+from mistyle.solver.settings import measured_subsamples
 
 TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
 
@@ -118,12 +120,13 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
+        fitted, _ = hold_out(whole, s.references)
+        first_asset(run, asset, texels, subset(whole, fitted))
         whole, photometry = match_exposures(run, asset, whole, shots)
         captures, notes = average_pictures(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *notes))
         if job.lights == "unknown":
             captures = with_light(run, asset, captures)
-        fitted, _ = hold_out(captures, s.references)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
         recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
@@ -359,6 +362,8 @@ def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any, memory
     """The renderer of the one picture of `captures`; it keeps at most `memory` bytes of the picture's samples."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
-    subsamples = chosen.soft_subsamples if has_soft(captures.lights) else chosen.subsamples
-    options = RenderOptions(chosen.model, chosen.frame, subsamples, memory=memory, gradients=False)
+    subsamples = measured_subsamples(chosen, has_soft(captures.lights))
+    options = RenderOptions(
+        chosen.model, chosen.frame, subsamples, memory=memory, directions=chosen.soft_measured, gradients=False
+    )
     return MaterialRenderer(traced, captures, sizes, options)

@@ -1,8 +1,9 @@
 """The stage "recover" of `mistyle fit`: passes within the limits of `--passes` and `--minutes`, checkpoints, and assets
 of the maps so far, which the finished asset replaces.
 
-The first asset follows the first pass; others follow whenever the time since the start has doubled, and at a stop
-request. Each has the finished asset's path and is marked by "passes" in `asset/done.json` and in the GLB's provenance.
+An asset follows the first pass (before it: `first_look.py`); others follow whenever the time since the start has
+doubled, and at a stop request. Each has the finished asset's path and is marked by "passes" in `asset/done.json` and
+in the GLB's provenance.
 """
 
 import time

@@ -27,6 +27,7 @@ from mistyle.jobs.stages import claim_run
 from mistyle.solver.schedule import COVERED, FILLED, SHOWN
 
 LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pictures
+FIRST_ASSET = 2  # of few small pictures whatever the references
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
 PHOTOMETRY_SECONDS = 15  # the number of points is bounded
 
@@ -52,7 +53,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     stages = {
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
-        "cameras": 1 + PER_ALIGNED * len(sizes),
+        "cameras": 1 + PER_ALIGNED * len(sizes) + FIRST_ASSET,
         **({"photometry": PHOTOMETRY_SECONDS + 1.5 * sum(sizes) * PER_READ_PIXEL} if unknown else {}),
         "pictures": sum(sizes) * PER_READ_PIXEL,
         **({"light": LIGHT_SECONDS} if unknown else {}),

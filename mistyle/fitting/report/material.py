@@ -85,7 +85,7 @@ def material_report(folder: Path, results: Any, progress: Progress, report: Call
         steps=steps(results),
         maps=map_sets(results),
         model=page_model(results.folder / f"{results.job.name}.glb"),
-        timings=tuple(Timing(MATERIAL_STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
+        timings=tuple(Timing(MATERIAL_STAGES.get(k, k), v, k in progress.reused) for k, v in progress.seconds.items()),
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in measured.items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),

@@ -114,6 +114,18 @@ class MaterialSettings(BaseModel):
 
 
 MATERIAL_PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {"atlas": {"size": 512}, "recover": {"iterations": 240, "bounces": 2, "bounce_samples": 32}},
+    "draft": {
+        "atlas": {"size": 512},
+        "recover": {
+            "iterations": 96,
+            "bounces": 2,
+            "bounce_samples": 32,
+            "solver_texels": 500_000,
+            "soft_subsamples": 1,
+            "soft_bounces": 0,
+            "soft_measured": 32,
+            "detail": True,
+        },
+    },
     "standard": {},
 }

@@ -45,7 +45,7 @@ from mistyle.solver.journal import Journal
 from mistyle.solver.pass_state import PassState
 from mistyle.solver.prior import MARGIN, NOTHING
 from mistyle.solver.schedule import Pass
-from mistyle.solver.settings import RecoverSettings, joint_steps
+from mistyle.solver.settings import RecoverSettings, joint_steps, under_soft_light
 from mistyle.solver.smoothing import LEAST, prior_precision_matrix
 from mistyle.solver.table import Atlas, with_seam_weights
 from mistyle.solver.texels.observations import observation_std
@@ -226,9 +226,10 @@ def _linearised(
 
 
 def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSettings:
-    """The settings, with `joint` 0 where no joint steps are planned (`joint_steps`) or a light is soft."""
-    some = 0 if has_soft(captures.lights) else joint_steps(settings)
-    return settings.model_copy(update={"joint": some})
+    """The settings, with `joint` 0 where no joint steps are planned (`joint_steps`), and those of soft light."""
+    if has_soft(captures.lights):
+        return under_soft_light(settings)
+    return settings.model_copy(update={"joint": joint_steps(settings)})
 
 
 def _residual_stds(problem: JointProblem) -> list[ResidualStd]:

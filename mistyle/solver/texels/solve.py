@@ -80,11 +80,7 @@ def texel_level(
     progress: Callable[[float], None],
 ) -> TexelLevel:
     """The level with its observations; `renderer` gives that of the atlas."""
-    sizes, soft = context.atlas.sizes, has_soft(context.captures.lights)
-    covered = sum(int(c.sum()) for c in context.atlas.covered)
-    by = solver_level(context.settings, covered, len(context.captures), soft)
-    while by > 1 and any(side % by or side // by < 8 for size in sizes for side in size):
-        by //= 2
+    by, sizes, soft = level_factor(context), context.atlas.sizes, has_soft(context.captures.lights)
     if by == 1:
         return _level(context, renderer(), 1, start, progress)
     mesh = context.traced.mesh
@@ -102,6 +98,15 @@ def texel_level(
     context.notes.extend([note] * (note not in context.notes))
     # Its texels are larger than pixels, and samples under soft light are slow.
     return _level(coarse, coarse.renderer(1 if soft else None, left), by, start, progress)
+
+
+def level_factor(context: FitContext) -> int:
+    """The ratio of the atlas's side to that of the level."""
+    covered = sum(int(c.sum()) for c in context.atlas.covered)
+    by = solver_level(context.settings, covered, len(context.captures), has_soft(context.captures.lights))
+    while by > 1 and any(side % by or side // by < 8 for size in context.atlas.sizes for side in size):
+        by //= 2
+    return by
 
 
 def _level(
@@ -164,7 +169,7 @@ def solution_after_rounds(
         sampling = one.samples, context.seed + one.begin
         for k, light, _ in journalled_light(context, level.renderer, table, sampling, journal, progress.part(0, 0.4)):
             direct = direct.with_indirect(k, light)
-    observed = _observed_direct(level.observed, direct) if direct.indirect else level.observed
+    observed = observed_direct(level.observed, direct) if direct.indirect else level.observed
     if one.samples:
         problem.reweight(observed.observations.weight)
         problem.retarget(observed.observations.rgb)
@@ -334,7 +339,7 @@ def journalled_light(
         yield k, journal.part(f"light.{k}", lambda light=light: {"light": light})["light"], None
 
 
-def _observed_direct(observed: TexelObservations, direct: DirectCaptures) -> TexelObservations:
+def observed_direct(observed: TexelObservations, direct: DirectCaptures) -> TexelObservations:
     """The observations without indirect light, whose uncertainty reduces their weights."""
     rgb, weight = observed.observations.rgb.copy(), observed.observations.weight.copy()
     for k, samples in enumerate(observed.per_image):

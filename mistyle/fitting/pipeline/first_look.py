@@ -1,0 +1,83 @@
+"""The first asset of a fit: the pictures as an unlit texture, seconds after the start.
+
+A texel has the median of the pictures that show it, so light and shadows are still in its albedo. Normals are the
+mesh's, roughness is constant. The asset of the first pass replaces this one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.atlas.texels import rasterise
+from mistyle.core.asset import Asset
+from mistyle.core.capture import Captures, shrunk, subset
+from mistyle.core.image import luminance, nearest_fill, resize
+from mistyle.core.light import Ambient
+from mistyle.core.maps import Maps, Texels, flat_maps
+from mistyle.fitting.pipeline.files import write
+from mistyle.io.store.atomic import digest
+from mistyle.jobs.stages import Run
+from mistyle.render.mitsuba.draw import Tracer, tracer
+from mistyle.solver.texels.observations import ObservationOptions, collect_observations
+
+PICTURES, SIDE, ATLAS = 12, 512, 512  # most pictures, pixels along their longer side, and texels a side
+BRIGHT = 0.8  # luminance of the 95th percentile of the albedo
+STATE = "no pass: the pictures as texture, with their light"
+
+Texture = tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]
+
+
+def first_asset(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures) -> None:
+    """Write the asset, unless the folder has one already or no picture shows the mesh."""
+    job = run.job
+    if (job.out / "asset").exists():
+        return
+    with run.progress.stage("first asset", "write the first asset"):
+        maps = first_look(asset, texels, captures)
+        if any(m.known.any() for m in maps):
+            sets = list(zip(texels, maps, strict=True))
+            key = digest([run.base, "first look"])
+            run.preliminary("asset", key, lambda folder: write(folder, job, asset, sets, state=STATE), {"first": True})
+
+
+def first_look(asset: Asset, texels: Sequence[Texels], captures: Captures) -> tuple[Maps, ...]:
+    """The maps at the size of `texels`, from few small pictures on a coarse level of the atlas."""
+    chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
+    few = subset(captures, chosen.tolist())
+    few = shrunk(few, [-(-max(camera.size) // SIDE) for camera in few.cameras])
+    mesh, sizes = asset.mesh, [len(t.covered) for t in texels]
+    coarse = [rasterise(mesh, part, min(ATLAS, size)) for part, size in enumerate(sizes)]
+    textures = median_textures(tracer(mesh), coarse, few)
+    shown = np.concatenate([luminance(texture[known]) for texture, known in textures])
+    factor = BRIGHT / max(float(np.quantile(shown, 0.95)), 1e-9) if len(shown) else 1.0
+    result = []
+    for (texture, known), size in zip(textures, sizes, strict=True):
+        albedo = np.clip(factor * resize(nearest_fill(texture, known), (size, size)), 0, 1)
+        seen = resize(known.astype(np.float32), (size, size)) > 0.5
+        result.append(replace(flat_maps(size), albedo=albedo, known=seen))
+    return tuple(result)
+
+
+def median_textures(traced: Tracer, texels: Sequence[Texels], captures: Captures) -> list[Texture]:
+    """Per texture set the median radiance of the pictures that show a texel, and which texels any picture shows."""
+    lit = replace(captures, lights=((Ambient((1.0, 1.0, 1.0)),),) * len(captures))
+    observed = collect_observations(traced, texels, lit, None, ObservationOptions(skies=False))
+    values, texel = observed.observations.rgb, np.repeat(np.arange(len(observed.texel)), observed.seen)
+    first, count = observed.observations.start[:-1], observed.seen
+    shown = np.flatnonzero(count)
+    median = np.zeros((len(count), 3), np.float32)
+    for c in range(3):
+        ordered = values[np.lexsort((values[:, c], texel)), c]
+        low, high = (first + np.maximum(count - 1, 0) // 2)[shown], (first + count // 2)[shown]
+        median[shown, c] = (ordered[low] + ordered[high]) / 2
+    texture = np.zeros((sum(t.covered.size for t in texels), 3), np.float32)
+    known = np.zeros(len(texture), bool)
+    texture[observed.texel], known[observed.texel] = median, count > 0
+    result, begin = [], 0
+    for size in (t.covered.shape for t in texels):
+        part = slice(begin, begin + size[0] * size[1])
+        begin = part.stop
+        result.append((texture[part].reshape(*size, 3), known[part].reshape(size)))
+    return result
