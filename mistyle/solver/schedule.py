@@ -28,6 +28,9 @@ SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 FILLED = 0.55  # the object's share of its bounding box in a picture, or of a picture without alpha or mask
 OBSERVED = 2**26  # most observations of the per-texel solver, of texels of which one picture sees SEEN
 LARGE = 4_000_000  # pixels of a picture from which it is averaged for a coarser level of that solver
+# Texels of a set that are smoothed at once. Joint steps need JOINT_TEXEL bytes of `recover.memory` for each further
+# texel of the atlas, and JOINT_PIXEL or more for each pixel of the object.
+WHOLE, JOINT_TEXEL, JOINT_PIXEL = 2**22, 750, 240
 JUDGES = 48  # pictures whose loss accepts or rejects the steps on whole pictures
 RESTARTS = 3  # rounds in which texels also start from their neighbours' values
 CLASS_ROUNDS = 2  # rounds after each solve from the start in which metal and dielectric are both tried
@@ -128,6 +131,12 @@ def solver_level(settings: RecoverSettings, covered: float, pictures: int, soft:
     while settings.solver != "pictures" and covered / by**2 > most:
         by *= 2
     return by
+
+
+def joint_bytes(texels: float, pixels: float = 0) -> float:
+    """Bytes of `recover.memory` that joint steps need at least, for an atlas of so many texels and so many pixels of
+    the object. The budget of a fit holds what the first WHOLE texels need."""
+    return JOINT_TEXEL * max(0.0, texels - WHOLE) + JOINT_PIXEL * pixels
 
 
 def collecting_seconds(settings: RecoverSettings, size: Size) -> float:
