@@ -39,6 +39,7 @@ CLASS_ROUNDS = 2  # rounds after each solve from the start in which metal and di
 PER_OBSERVATION, PER_CELL = 2.5e-8, 3.5e-9  # a texel in a picture, in one step of the per-texel solver
 PER_SAMPLE, PER_SAMPLE_CELL = 2e-8, 1.5e-9  # a sample of a pixel, rendered
 PER_COLLECTED = 4e-7  # a sample of a pixel, collected once
+CACHED = 77  # bytes of a cached sample
 GRADIENT = 2.9  # a step's cost over that of a picture
 PER_VISIBILITY = 1.3e-8  # a sample and a cell, once
 PER_PATH, PER_SOFT_PATH = 1.2e-7, 3e-7  # a path of indirect light
@@ -156,7 +157,8 @@ def finishing_seconds(settings: RecoverSettings, size: Size) -> float:
     """Seconds after the last pass: the loss before and after, smoothing, and the residual of every picture."""
     judged = min(1.0, JUDGES / size.pictures) if descent_steps(settings) else 0
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
-    return (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + smoothing
+    again = (1 + 2 * judged) * _collecting(settings, size, size.samples)
+    return (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + again + smoothing
 
 
 def _rendering(settings: RecoverSettings, size: Size) -> float:
@@ -164,11 +166,18 @@ def _rendering(settings: RecoverSettings, size: Size) -> float:
     return size.samples * (PER_SAMPLE_CELL * (settings.soft_cells + 16) if size.cells else PER_SAMPLE)
 
 
+def _collecting(settings: RecoverSettings, size: Size, samples: float) -> float:
+    """Seconds of collecting once more, among so many samples, those that `recover.memory` does not hold."""
+    kept = min(1.0, 1e9 * settings.memory / (CACHED * max(samples, 1)))
+    return (1 - kept) * samples * (PER_COLLECTED + settings.soft_cells * PER_VISIBILITY * (size.cells > 0))
+
+
 def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     """Approximate seconds of a pass."""
-    render = _rendering(settings, size)
+    render, again = _rendering(settings, size), _collecting(settings, size, size.samples)
     if one.kind in ("solve", "rounds"):
         render *= size.rough / size.samples
+        render += _collecting(settings, size, size.rough)
     step = size.observations * (PER_CELL * size.cells if size.cells else PER_OBSERVATION)
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
     total = one.samples * size.paths * (PER_SOFT_PATH if size.cells else PER_PATH) + (render if one.samples else 0)
@@ -180,7 +189,7 @@ def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
         restarts = max(0, min(most - rounds_since(one, one.begin, settings), one.steps))
         total += one.steps * render + (restarts * metals * RESTARTED + (one.steps - restarts) * CONTINUED) * step
     elif one.kind == "pictures":
-        total += one.steps * GRADIENT * render / size.pictures + smoothing
+        total += one.steps * (GRADIENT * render + again) / size.pictures + smoothing
     elif one.kind == "joint":
         ratio = settings.joint_subsamples / settings.subsamples
         total += one.steps * (size.samples * ratio * PER_JOINT + 3 * smoothing)
