@@ -57,7 +57,7 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.solver.recover import recover
-from mistyle.solver.schedule import COVERED, SHOWN
+from mistyle.solver.schedule import COVERED, FILLED
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.validate import downsampling_factors
 
@@ -176,8 +176,8 @@ def real_size(place: Path, options: argparse.Namespace) -> dict[str, float]:
     seconds, done = time.perf_counter() - start, told["passes"]["done"]
     settings = MaterialSettings.model_validate(json.loads((place / "real_run/run.json").read_text())["settings"])
     pixels, covered = [size[0] * size[1]] * count, COVERED * options.atlas**2
-    first = recover_seconds(settings.model_copy(update={"passes": done}), pixels, covered, False, SHOWN)
-    whole = recover_seconds(settings.model_copy(update={"recover": RecoverSettings()}), pixels, covered, False, SHOWN)
+    first = recover_seconds(settings.model_copy(update={"passes": done}), pixels, covered, False, FILLED)
+    whole = recover_seconds(settings.model_copy(update={"recover": RecoverSettings()}), pixels, covered, False, FILLED)
     print(json.dumps({"seconds": told["seconds"], "peaks_gb": told["peaks_gb"], "planned": planned}), file=sys.stderr)
     rest = sum(told["seconds"].values()) - told["seconds"]["recover"]
     figures = {

@@ -152,7 +152,8 @@ def recover(
     from mistyle.render.deferred.image_samples import tangents_of
     from mistyle.render.mitsuba.draw import tracer
 
-    settings, notes = where_possible(settings, captures), []
+    notes: list[str] = []
+    settings = where_possible(settings, captures, sum(t.covered.size for t in texels), notes)
     usable, traced = validate_captures(mesh, captures, notes), tracer(mesh)
     # The steps on whole pictures have no neighbours.
     grid = atlas_of(texels) if settings.solver == "pictures" else linked(mesh, texels)

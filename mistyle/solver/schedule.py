@@ -29,6 +29,9 @@ SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 FILLED = 0.55  # the object's share of its bounding box in a picture, or of a picture without alpha or mask
 OBSERVED = 2**26  # most observations of the per-texel solver, of texels of which one picture sees SEEN
 LARGE = 4_000_000  # pixels of a picture from which it is averaged for a coarser level of that solver
+# Texels of a set that are smoothed at once. Joint steps need JOINT_TEXEL bytes of `recover.memory` for each further
+# texel of the atlas, and JOINT_PIXEL or more for each pixel of the object.
+WHOLE, JOINT_TEXEL, JOINT_PIXEL = 2**22, 750, 240
 JUDGES = 48  # pictures whose loss accepts or rejects the steps on whole pictures
 RESTARTS = 3  # rounds in which texels also start from their neighbours' values
 CLASS_ROUNDS = 2  # rounds after each solve from the start in which metal and dielectric are both tried
@@ -37,6 +40,7 @@ CLASS_ROUNDS = 2  # rounds after each solve from the start in which metal and di
 PER_OBSERVATION, PER_CELL = 2.5e-8, 3.5e-9  # a texel in a picture, in one step of the per-texel solver
 PER_SAMPLE, PER_SAMPLE_CELL = 2e-8, 1.5e-9  # a sample of a pixel, rendered
 PER_COLLECTED = 4e-7  # a sample of a pixel, collected once
+CACHED = 77  # bytes of a cached sample
 GRADIENT = 2.9  # a step's cost over that of a picture
 PER_VISIBILITY = 1.3e-8  # a sample and a cell, once
 PER_PATH, PER_SOFT_PATH = 1.2e-7, 3e-7  # a path of indirect light
@@ -132,6 +136,12 @@ def solver_level(settings: RecoverSettings, covered: float, pictures: int, soft:
     return by
 
 
+def joint_bytes(texels: float, pixels: float = 0) -> float:
+    """Bytes of `recover.memory` that joint steps need at least, for an atlas of so many texels and so many pixels of
+    the object. The budget of a fit holds what the first WHOLE texels need."""
+    return JOINT_TEXEL * max(0.0, texels - WHOLE) + JOINT_PIXEL * pixels
+
+
 def collecting_seconds(settings: RecoverSettings, size: Size) -> float:
     """Seconds before the first pass: observations, and the samples of the pictures."""
     samples = size.samples + (size.rough if size.rough < size.samples else 0)
@@ -149,7 +159,8 @@ def finishing_seconds(settings: RecoverSettings, size: Size) -> float:
     detail = settings.detail * size.pictures * size.texels * (PER_DETAIL if size.cells else PER_DETAIL / 4)
     judged = min(1.0, JUDGES / size.pictures) if descent_steps(settings) else 0
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
-    return (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + smoothing + detail
+    again = (1 + 2 * judged) * _collecting(settings, size, size.samples)
+    return (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + again + smoothing + detail
 
 
 def _rendering(settings: RecoverSettings, size: Size) -> float:
@@ -157,11 +168,18 @@ def _rendering(settings: RecoverSettings, size: Size) -> float:
     return size.samples * (PER_SAMPLE_CELL * (settings.soft_cells + 16) if size.cells else PER_SAMPLE)
 
 
+def _collecting(settings: RecoverSettings, size: Size, samples: float) -> float:
+    """Seconds of collecting once more, among so many samples, those that `recover.memory` does not hold."""
+    kept = min(1.0, 1e9 * settings.memory / (CACHED * max(samples, 1)))
+    return (1 - kept) * samples * (PER_COLLECTED + settings.soft_cells * PER_VISIBILITY * (size.cells > 0))
+
+
 def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     """Approximate seconds of a pass."""
-    render = _rendering(settings, size)
+    render, again = _rendering(settings, size), _collecting(settings, size, size.samples)
     if one.kind in ("solve", "rounds"):
         render *= size.rough / size.samples
+        render += _collecting(settings, size, size.rough)
     step = size.observations * (PER_CELL * size.cells if size.cells else PER_OBSERVATION)
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
     total = one.samples * size.paths * (PER_SOFT_PATH if size.cells else PER_PATH) + (render if one.samples else 0)
@@ -173,7 +191,7 @@ def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
         restarts = max(0, min(most - rounds_since(one, one.begin, settings), one.steps))
         total += one.steps * render + (restarts * metals * RESTARTED + (one.steps - restarts) * CONTINUED) * step
     elif one.kind == "pictures":
-        total += one.steps * GRADIENT * render / size.pictures + smoothing
+        total += one.steps * (GRADIENT * render + again) / size.pictures + smoothing
     elif one.kind == "joint":
         ratio = settings.joint_subsamples / settings.subsamples
         total += one.steps * (size.samples * ratio * PER_JOINT + 3 * smoothing)

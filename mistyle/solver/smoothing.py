@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 from mistyle.atlas.neighbours import Links, within
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
 from mistyle.solver.prior import METAL_SPREAD
+from mistyle.solver.schedule import WHOLE
 from mistyle.solver.table import OVER_SEAMS, Atlas, diffused, fill, with_seam_weights
 
 # The smoothed channels of the table, and the least standard deviation of their second differences. Metallic is not
@@ -38,9 +39,9 @@ ELSEWHERE = 0.1  # weight of the whole atlas in the local spread, in exactly kno
 SHARE = 0.3  # precision of a tilt relative to 1 / spread², since its neighbours are correlated
 WIDER = 2.0  # factor of the variance across a seam: the linked texel lies beside the neighbour's true place
 STEPS, CLOSE = 300, 1e-4  # most iterations of conjugate gradients, and their relative residual
-# Texels of a set that are solved at once. A larger set is solved in bands of rows, each with HALO rows on either side,
-# which are several correlation lengths of LEAST and OPEN.
-WHOLE, BAND, HALO = 2**22, 2**20, 64
+# Texels of a band of rows, where a set has more than WHOLE, and the rows on either side that are solved with it, which
+# are several correlation lengths of LEAST and OPEN.
+BAND, HALO = 2**20, 64
 
 Grid = Float[np.ndarray, "h w"]
 Line = Bool[np.ndarray, "h v"]  # texels with a neighbour on either side in their row

@@ -213,8 +213,11 @@ def test_steps_that_help_not_or_need_too_much_are_left_out(world, monkeypatch): 
 
 def test_where_there_are_none(world):  # noqa: F811
     _, _, _, captures = world
-    assert joint.where_possible(QUICK, captures).joint == 3
+    notes: list[str] = []
+    assert joint.where_possible(QUICK, captures, 1000, notes).joint == 3
     soft = replace(captures, lights=((Ambient((1.0, 1.0, 1.0)),), *captures.lights[1:]))
-    assert joint.where_possible(QUICK, soft).joint == 0
+    assert joint.where_possible(QUICK, soft, 1000, notes).joint == 0
     for changed in ({"solver": "texels"}, {"solver": "pictures"}, {"smooth": False}):
-        assert joint.where_possible(QUICK.model_copy(update=changed), captures).joint == 0
+        assert joint.where_possible(QUICK.model_copy(update=changed), captures, 1000, notes).joint == 0
+    assert not notes
+    assert joint.where_possible(QUICK, captures, 4096**2, notes).joint == 0 and "atlas" in notes[0]

@@ -6,7 +6,7 @@ from typing import Any
 from mistyle.core.maps import Texels
 from mistyle.jobs.plan import PER_SAMPLE_RAY, PER_TEXEL
 from mistyle.jobs.settings import thread_count
-from mistyle.solver.schedule import finishing_seconds, picture_seconds, size_from, whole_seconds
+from mistyle.solver.schedule import COVERED, finishing_seconds, joint_bytes, picture_seconds, size_from, whole_seconds
 from mistyle.solver.settings import RecoverSettings, joint_steps, under_soft_light
 
 PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
@@ -15,7 +15,9 @@ PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
 def recover_seconds(settings: Any, pixels: Sequence[int], covered: float, soft: bool, shown: float) -> float:
     """Seconds of the passes within `--passes`, and of what precedes and follows them."""
     chosen: RecoverSettings = settings.recover
-    chosen = under_soft_light(chosen) if soft else chosen.model_copy(update={"joint": joint_steps(chosen)})
+    fits = joint_bytes(covered / COVERED, shown * sum(pixels)) < 1e9 * chosen.memory
+    joint = joint_steps(chosen) if fits else 0
+    chosen = under_soft_light(chosen) if soft else chosen.model_copy(update={"joint": joint})
     return whole_seconds(chosen, size_from(chosen, pixels, covered, soft, shown), settings.passes or None)
 
 

@@ -44,7 +44,7 @@ from mistyle.solver.joint.pixels import (
 from mistyle.solver.journal import Journal
 from mistyle.solver.pass_state import PassState
 from mistyle.solver.prior import MARGIN, NOTHING
-from mistyle.solver.schedule import Pass
+from mistyle.solver.schedule import Pass, joint_bytes
 from mistyle.solver.settings import RecoverSettings, joint_steps, under_soft_light
 from mistyle.solver.smoothing import LEAST, prior_precision_matrix
 from mistyle.solver.table import Atlas, with_seam_weights
@@ -68,6 +68,10 @@ FREE = 0.5  # standard deviation of unobserved unknowns
 ALIKE = 0.03  # standard deviation between an uncovered texel, seen at chart borders, and the nearest covered one
 LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # largest change of an unknown in one step
 STEEPEST = 0.98  # largest length of a tilt
+TOO_LARGE = (
+    "The joint steps were skipped: they need more than the {:g} GB of recover.memory. Raise it, or use fewer or "
+    "smaller pictures or a smaller atlas."
+)
 SEED = 104_729  # offset of these seeds from those of other stages
 
 
@@ -121,10 +125,7 @@ def joint_setup(context: FitContext, renderer: "MaterialRenderer") -> JointSetup
     """
     footprints = image_footprints(context, renderer)
     if footprints is None:
-        context.notes.append(
-            f"The joint steps were skipped: they need more than the {context.settings.memory:g} GB of "
-            "recover.memory. Raise it, or use fewer or smaller pictures."
-        )
+        context.notes.append(TOO_LARGE.format(context.settings.memory))
         return None
     pictures, unknown, memory = footprints
     return JointSetup(renderer.with_memory(memory), pictures, unknown, unknown_frames(context, unknown))
@@ -225,11 +226,16 @@ def _linearised(
     ]
 
 
-def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSettings:
-    """The settings, with `joint` 0 where no joint steps are planned (`joint_steps`), and those of soft light."""
+def where_possible(settings: RecoverSettings, captures: Captures, texels: int, notes: list[str]) -> RecoverSettings:
+    """The settings, with `joint` 0 where no joint steps are planned (`joint_steps`) or, with a note, where the atlas is
+    too large for `settings.memory`; and those of soft light."""
     if has_soft(captures.lights):
         return under_soft_light(settings)
-    return settings.model_copy(update={"joint": joint_steps(settings)})
+    some = joint_steps(settings)
+    if some and joint_bytes(texels) > 1e9 * settings.memory:
+        notes.append(TOO_LARGE.format(settings.memory))
+        some = 0
+    return settings.model_copy(update={"joint": some})
 
 
 def _residual_stds(problem: JointProblem) -> list[ResidualStd]:

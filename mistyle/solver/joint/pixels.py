@@ -21,15 +21,14 @@ from mistyle.render.deferred.image_samples import SampleBlock, Sampling, Texture
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, TILT
 from mistyle.solver.context import FitContext
 from mistyle.solver.indirect import PALE, enlarged
-from mistyle.solver.smoothing import WHOLE
+from mistyle.solver.schedule import JOINT_PIXEL, joint_bytes
 from mistyle.solver.table import fill
 from mistyle.solver.texels.observations import covered_rows, points_of
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
-PIXEL, WEIGHT = 240, 8  # bytes of a pixel, and of a bilinear weight
-TEXEL = 750  # bytes of a texel of atlases with more than WHOLE texels, which the budget of a fit leaves out
+WEIGHT = 8  # bytes of a bilinear weight
 LEAST_Z = 0.2  # least z of a mapped normal
 FLASH = (Point((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "camera"),)
 
@@ -61,9 +60,7 @@ def image_footprints(
     and the bytes of memory that remain. None if the memory does not suffice."""
     settings, cameras = context.settings, context.captures.cameras
     left, images, seen = settings.memory * 1e9, dict[int, ImageFootprint](), np.zeros(renderer.texels, bool)
-    left -= TEXEL * max(0, renderer.texels - WHOLE)
-    if left < 0:
-        return None
+    left -= joint_bytes(renderer.texels)
     for group in by_camera(cameras):
         every = _covered_pixels(context, renderer, cameras[group[0]]) if settings.bounces else None
         for k in group:
@@ -71,7 +68,7 @@ def image_footprints(
             images[k] = lit if every is None else _with_unlit(lit, every)
             fetch = images[k].fetch
             seen[fetch.indices] = True
-            left -= PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
+            left -= JOINT_PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
             if left < 0:
                 return None
     result = [images[k] for k in range(len(cameras))]
