@@ -9,6 +9,7 @@ from mistyle.jobs.settings import thread_count
 from mistyle.solver.schedule import finishing_seconds, picture_seconds, size_from, whole_seconds
 from mistyle.solver.settings import RecoverSettings, joint_steps, under_soft_light
 
+FIRST_PICTURES = 8  # most pictures of the first asset: large ones are slow to read
 PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
 
 
