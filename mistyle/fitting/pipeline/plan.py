@@ -27,7 +27,7 @@ from mistyle.solver.schedule import COVERED, FILLED, SHOWN
 
 LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pictures
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
-PHOTOMETRY_SECONDS = 15  # the number of points is bounded
+PHOTOMETRY_SECONDS = 12  # the number of points is bounded
 
 
 def plan_material(job: Any) -> dict[str, Any]:
