@@ -19,6 +19,7 @@ Five jobs, each as a user starts it, with the drafts' preset but for `delta`:
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -145,7 +146,7 @@ def written(name: str, folder: Path, shots: Sequence[Shot], encoded: bool = Fals
         lights[shot.camera.name] = shot.lights
     for light in {id(light): light for rig in lights.values() for light in rig}.values():
         if isinstance(light, Environment) and not (folder / light.file).exists():
-            (folder / light.file).symlink_to(data_folder() / "hdri" / light.file)
+            shutil.copyfile(data_folder() / "hdri" / light.file, folder / light.file)
     (folder / "transforms.json").write_text(json.dumps(transforms([shot.camera for shot in shots], files)))
     if not encoded:
         (folder / "lights.json").write_text(json.dumps(to_json((), lights)))

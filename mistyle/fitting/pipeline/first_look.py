@@ -17,12 +17,13 @@ from mistyle.core.image import luminance, nearest_fill, resize
 from mistyle.core.light import Ambient
 from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.fitting.pipeline.files import write
+from mistyle.fitting.pipeline.times import FIRST_PICTURES
 from mistyle.io.store.atomic import digest
 from mistyle.jobs.stages import Run
 from mistyle.render.mitsuba.draw import Tracer, tracer
 from mistyle.solver.texels.observations import ObservationOptions, collect_observations
 
-PICTURES, SIDE, ATLAS = 12, 512, 512  # most pictures, pixels along their longer side, and texels a side
+SIDE, ATLAS = 512, 512  # pixels along the longer side of a picture, texels a side
 BRIGHT = 0.8  # luminance of the 95th percentile of the albedo
 STATE = "no pass: the pictures as texture, with their light"
 
@@ -44,7 +45,7 @@ def first_asset(run: Run, asset: Asset, texels: Sequence[Texels], captures: Capt
 
 def first_look(asset: Asset, texels: Sequence[Texels], captures: Captures) -> tuple[Maps, ...]:
     """The maps at the size of `texels`, from few small pictures on a coarse level of the atlas."""
-    chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(captures) - 1, FIRST_PICTURES).round().astype(int))
     few = subset(captures, chosen.tolist())
     few = shrunk(few, [-(-max(camera.size) // SIDE) for camera in few.cameras])
     mesh, sizes = asset.mesh, [len(t.covered) for t in texels]

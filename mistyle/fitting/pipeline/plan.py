@@ -12,7 +12,7 @@ from mistyle.fitting.pipeline.budget import (
     needs_of,
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
-from mistyle.fitting.pipeline.times import closing_stages, recover_seconds
+from mistyle.fitting.pipeline.times import FIRST_PICTURES, closing_stages, recover_seconds
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
@@ -27,9 +27,8 @@ from mistyle.jobs.stages import claim_run
 from mistyle.solver.schedule import COVERED, FILLED, SHOWN
 
 LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pictures
-FIRST_ASSET = 2  # of few small pictures whatever the references
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
-PHOTOMETRY_SECONDS = 15  # the number of points is bounded
+PHOTOMETRY_SECONDS = 12  # the number of points is bounded
 
 
 def plan_material(job: Any) -> dict[str, Any]:
@@ -53,7 +52,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     stages = {
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
-        "cameras": 1 + PER_ALIGNED * len(sizes) + FIRST_ASSET,
+        "cameras": 1 + PER_ALIGNED * len(sizes) + first_asset_seconds(sizes),
         **({"photometry": PHOTOMETRY_SECONDS + 1.5 * sum(sizes) * PER_READ_PIXEL} if unknown else {}),
         "pictures": sum(sizes) * PER_READ_PIXEL,
         **({"light": LIGHT_SECONDS} if unknown else {}),
@@ -72,6 +71,11 @@ def plan_material(job: Any) -> dict[str, Any]:
         "peaks_gb": peaks(needs_of(s, sizes, *size), material_counts(s, sizes, *size)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + stored) / 1e9, 2),
     }
+
+
+def first_asset_seconds(sizes: list[int]) -> float:
+    """Seconds of reading and projecting the few pictures of the first asset, of so many pixels each."""
+    return 1 + sum(sizes) * min(1, FIRST_PICTURES / len(sizes)) * PER_READ_PIXEL
 
 
 def masked(job: Any) -> bool:

@@ -4,12 +4,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from mistyle.core.maps import Texels
-from mistyle.jobs.plan import PER_SAMPLE_RAY, PER_TEXEL
+from mistyle.jobs.plan import PER_TEXEL
 from mistyle.jobs.settings import thread_count
 from mistyle.solver.schedule import COVERED, finishing_seconds, joint_bytes, picture_seconds, size_from, whole_seconds
 from mistyle.solver.settings import RecoverSettings, joint_steps, under_soft_light
 
+FIRST_PICTURES = 8  # most pictures of the first asset: large ones are slow to read
 PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
+PER_REPORT_RAY = 3e-7  # a sample of the report's pictures
 
 
 def recover_seconds(settings: Any, pixels: Sequence[int], covered: float, soft: bool, shown: float) -> float:
@@ -28,7 +30,7 @@ def closing_stages(settings: Any, pixels: Sequence[int], texels: float, soft: bo
         "measure": 1 + picture_seconds(settings.recover, pixels, soft, shown),
         "asset": 1 + 4 * texels * PER_TEXEL,
         "scene": 0.5 + texels * PER_SCENE_TEXEL,
-        "report": drawn * (5 + report.frames * report.resolution**2 * report.spp * PER_SAMPLE_RAY),
+        "report": drawn * (2 + report.frames * report.resolution**2 * report.spp * PER_REPORT_RAY),
     }
 
 
