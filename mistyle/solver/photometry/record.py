@@ -21,6 +21,24 @@ VEIL_TERMS = 6
 
 
 @dataclass(frozen=True)
+class Gains:
+    """Log gain per picture and channel, and the vignetting's coefficients."""
+
+    gain: Float[np.ndarray, "n 3"]
+    vignetting: Float[np.ndarray, "3"]
+
+    def moved(self, change: Float[np.ndarray, " m"]) -> "Gains":
+        """The gains after a change of all of them, row by row, and of the vignetting."""
+        n = len(self.gain)
+        return Gains(self.gain + change[: 3 * n].reshape(n, 3), self.vignetting + change[3 * n :])
+
+    def factor(self, k: int, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """The gain of picture k at every pixel."""
+        fall = fall_terms(coordinates(camera, pixel_centres(camera.size))) @ self.vignetting
+        return np.exp(self.gain[k] + fall[..., None])
+
+
+@dataclass(frozen=True)
 class Photometry:
     """n pictures, in the order of their captures; logarithms are natural.
 
