@@ -12,7 +12,7 @@ from mistyle.core.light import has_soft
 from mistyle.core.maps import Texels
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.indirect import enlarged
-from mistyle.solver.photometry.record import Gains
+from mistyle.solver.photometry.record import Gains, divided
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import Atlas
 
@@ -80,17 +80,11 @@ class DirectCaptures:
 
     def whole(self) -> Captures:
         """The pictures with all their light, without their gains."""
-        return self.captures if self.gains is None else Captures(self.captures.cameras, self.captures.lights, self._load)
-
-    def _load(self, k: int) -> Loaded:
-        rgb, mask = self.captures.load(k)
-        if self.gains is not None:
-            rgb = (rgb / self.gains.factor(k, self.captures.cameras[k])).astype(np.float32)
-        return rgb, mask
+        return self.captures if self.gains is None else divided(self.captures, self.gains)
 
     def load(self, k: int) -> Loaded:
         """Picture k less its indirect light, and its mask of valid pixels."""
-        rgb, mask = self._load(k)
+        rgb, mask = self.whole().load(k)
         if k in self.indirect:
             rgb = rgb - self.enlarged(k)
         return rgb, mask

@@ -16,31 +16,40 @@ with the median residual, so that priors keep the texels plain and the gains exp
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, shrunk
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
+from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.least_squares import one_hot
+from mistyle.core.light import has_soft
+from mistyle.core.maps import Texels
+from mistyle.solver.table import Atlas, linked
 from mistyle.solver.photometry.record import Gains, coordinates, fall_terms
 from mistyle.solver.prior import LEAST_SEEN, log_prior_penalty, metal_f0_prior, penalty
+from mistyle.solver.texels.gbuffer import open_sky, rig
 from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Points, Problem, Rig, Solution
 from mistyle.solver.texels.observations import (
     ObservationOptions,
     TexelObservations,
     collect_observations,
     observation_std,
+    points_of,
 )
-from mistyle.solver.texels.rounds import CLASSES, STARTS, best
+from mistyle.solver.texels.rounds import CLASSES, STARTS, best, best_by_region
 
 SIDE = 256  # pixels along the longer side of the small pictures
-ATLAS = 256  # texels a side of the atlas that the texels are chosen from, all sets together
-OBSERVATIONS = 60_000  # at most, about
+ATLAS, LEAST_SIDE = 128, 16  # texels a side of the coarse atlas, all sets together, and of each set at least
+LEAST_EACH = 300  # observations of a picture, at least on average
+CELLS = 256  # of soft light: highlights of metals must not depend on where a cell is
+OBSERVATIONS = 12_000  # at most, about
 MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.6, 0.0)  # prior of a texel: a sample of a bumpy surface, hardly tilted
 SPREAD = (1.0, 1.0, 1.0, 0.15, 0.15, 0.4, 0.1)
 NOISY = 0.01, 0.03  # standard deviation of an observation, as in `observation_std`
@@ -50,6 +59,7 @@ STARTED, INNER = 12, 6  # Levenberg-Marquardt steps from a start, and after a ch
 RESTARTS = 4  # steps of the gains between two solves of the texels from all starts
 STEPS = 16
 FIRST_SCALE = 4.0  # of the standard deviations in the first solve
+TURN = 0.0  # radians: error of the normal and of a light cell's direction
 DARK, LEAST = 0.01, 1e-6  # radiance of half the weight in the spread, and the least radiance in it
 SETTLED = 1e-3  # largest change of a log gain that counts as convergence
 LONGEST = 1.0  # largest change of a log gain in a step
@@ -76,6 +86,7 @@ class MaterialSamples:
     noise: tuple[float, float]
     defect: Float[np.ndarray, "o 3"] | None = None
     prior: tuple[Float[np.ndarray, "t 7"], Float[np.ndarray, "t 7"]] | None = None
+    regions: tuple[TexelObservations, Atlas] | None = None
 
     @property
     def pictures(self) -> int:
@@ -113,34 +124,56 @@ def material_samples(
     captures: Captures,
     tangents: Float[np.ndarray, "f 3 4"] | None,
     facing: float = 0.2,
-    seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
 ) -> MaterialSamples:
-    """Texels that at least LEAST_SEEN small pictures show in the light."""
+    """The observations of a coarse atlas in small pictures."""
     mesh = traced.mesh
     small = shrunk(captures, [-(-max(camera.size) // SIDE) for camera in captures.cameras])
-    texels = [rasterise(mesh, part, max(16, int(ATLAS / len(mesh.parts) ** 0.5))) for part in range(len(mesh.parts))]
-    options = ObservationOptions(facing, *NOISY, move=0)
-    observed = collect_observations(traced, texels, small, tangents, options, progress)
-    return chosen_samples(observed, small.cameras, NOISY, OBSERVATIONS, seed)[0]
+    options = ObservationOptions(facing, *NOISY, skies=False, move=0)
+
+    def observed_at(side: int, report: Callable[[float], None]) -> tuple[list[Texels], TexelObservations]:
+        texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
+        return texels, collect_observations(traced, texels, small, tangents, options, report)
+
+    side = max(LEAST_SIDE, int(ATLAS / len(mesh.parts) ** 0.5))
+    texels, observed = observed_at(side, lambda done: progress(0.5 * done))
+    count, most = len(observed.observations.rgb), max(OBSERVATIONS, LEAST_EACH * len(captures))
+    if count > most:
+        side = max(LEAST_SIDE, int(side * (most / count) ** 0.5))
+        texels, observed = observed_at(side, lambda done: progress(0.5 + 0.5 * done))
+    if has_soft(captures.lights):
+        position, normal, _ = points_of(texels)
+        sky = open_sky(traced, position, normal, even_directions(CELLS).astype(np.float32))
+        points = replace(observed.points, open=sky)
+        observed = replace(observed, points=points, rig=rig(small.cameras, small.lights, CELLS))
+    return replace(all_samples(observed, small.cameras, NOISY), regions=(observed, linked(mesh, texels)))
+
+
+def all_samples(
+    observed: TexelObservations, cameras: Sequence[Camera], noise: tuple[float, float]
+) -> MaterialSamples:
+    """All observations; `noise` are the arguments of their `observation_std`."""
+    seen = observed.observations
+    worth = seen.weight * observation_std(np.maximum(seen.rgb.max(axis=1, initial=0), 0), *noise)
+    x = positions(observed, cameras)
+    return MaterialSamples(observed.points, observed.rig, seen, x, worth.astype(np.float32), noise)
 
 
 def chosen_samples(
-    observed: TexelObservations, cameras: Sequence[Camera], noise: tuple[float, float], most: int, seed: int
+    observed: TexelObservations, cameras: Sequence[Camera], noise: tuple[float, float], most: float, seed: int
 ) -> tuple[MaterialSamples, Int[np.ndarray, " t"], Int[np.ndarray, " o"]]:
     """Texels with at least LEAST_SEEN observations, chosen at random for about `most` of them; and the rows of texels
     and observations."""
-    seen, count, p = observed.observations, observed.seen, observed.points
+    whole, count = all_samples(observed, cameras, noise), observed.seen
+    seen, p = whole.observations, whole.points
     usable = count >= LEAST_SEEN
     share = most / max(int(count[usable].sum()), 1)
     kept = np.flatnonzero(usable & (np.random.default_rng(seed).random(len(count)) < share))
     rows = np.flatnonzero(np.repeat(np.isin(np.arange(len(count)), kept), count))
-    worth = seen.weight * observation_std(np.maximum(seen.rgb.max(axis=1, initial=0), 0), *noise)
     start = np.concatenate([[0], np.cumsum(count[kept])])
     own = Observations(start, seen.picture[rows], seen.rgb[rows], seen.weight[rows], seen.lit[rows])
     points = Points(p.position[kept], p.frame[kept], None if p.open is None else p.open[kept])
-    x = positions(observed, cameras)[rows]
-    return MaterialSamples(points, observed.rig, own, x, worth[rows].astype(np.float32), noise), kept, rows
+    return MaterialSamples(points, whole.rig, own, whole.x[rows], whole.worth[rows], noise), kept, rows
 
 
 def problem_of(samples: MaterialSamples, options: Options) -> Problem:
@@ -153,27 +186,38 @@ def log_gain(samples: MaterialSamples, gains: Gains) -> Float[np.ndarray, "o 3"]
     return gains.gain[samples.observations.picture] + (fall_terms(samples.x) @ gains.vignetting)[:, None]
 
 
+def corrected_samples(
+    samples: MaterialSamples, gains: Gains
+) -> tuple[Float[np.ndarray, "o 3"], Float[np.ndarray, " o"]]:
+    """The observations without their gains, and their weights."""
+    y = (samples.observations.rgb / np.exp(log_gain(samples, gains))).astype(np.float32)
+    if samples.defect is not None:
+        y += samples.defect
+    level = np.maximum(y.max(axis=1, initial=0), 0)
+    return y, (samples.worth / observation_std(level, *samples.noise)).astype(np.float32)
+
+
 class _Solve:
     """The alternation; a class, since the problem on the device has a state: its targets and weights."""
 
     def __init__(self, samples: MaterialSamples, problem: Problem) -> None:
-        self.samples, self.problem, self.scale = samples, problem, 1.0
+        self.samples, self.problem, self.scale, self.steep = samples, problem, 1.0, 0.0
         self.y, self.weight = samples.observations.rgb, samples.observations.weight
 
     def target(self, gains: Gains) -> None:
         """Correct the observations by these gains."""
-        s = self.samples
-        self.y = (s.observations.rgb / np.exp(log_gain(s, gains))).astype(np.float32)
-        if s.defect is not None:
-            self.y += s.defect
-        level = np.maximum(self.y.max(axis=1, initial=0), 0)
-        self.weight = (s.worth / (self.scale * observation_std(level, *s.noise))).astype(np.float32)
+        self.y, weight = corrected_samples(self.samples, gains)
+        self.weight = (weight / (self.scale * (1 + weight * self.steep))).astype(np.float32)
         self.problem.retarget(self.y)
         self.problem.reweight(self.weight)
 
     def texels(self, values: np.ndarray, steps: int = INNER) -> Solution:
         """The texels from `values`, in their classes."""
         return self.problem.solve(values, *prior_of(self.samples, self.problem, values), steps)
+
+    def look(self, values: np.ndarray) -> None:
+        """Estimate the error of the model at `values` from its slope."""
+        self.steep = TURN * slopes(self.problem, values)
 
     def anew(self, values: np.ndarray | None = None) -> np.ndarray:
         """The best of all starts and of `values`."""
@@ -191,6 +235,8 @@ class _Solve:
             if metallic:
                 extra = extra + log_prior_penalty(solution.values, seen, "metal")
             tries.append((solution, extra))
+        if metallic and self.samples.regions is not None:
+            return best_by_region(self.problem, tries, *self.samples.regions).values
         return best(tries)[0].values
 
     def cost(self, solution: Solution) -> float:
@@ -233,6 +279,9 @@ def solve_with_material(
     work.target(gains)
     values = work.anew() if values is None else values
     for k in range(steps):
+        work.look(values)
+        work.scale = 1.0
+        work.target(gains)
         work.scale = max(1.0, work.residual(values) / USUAL)
         work.target(gains)
         values = work.texels(values).values if fixed or k % RESTARTS else work.anew(values)
@@ -262,7 +311,7 @@ def _fit_of(work: _Solve, gains: Gains, solution: Solution, full: bool) -> Mater
     weight = y**2 / (y**2 + DARK**2)
     spread = 1.4826 * _weighted_median(np.abs(np.log(y / f)).ravel(), weight.ravel())
     system = reduced_system(work.samples, work.problem, solution.values, work.y, work.weight)
-    covariance = np.linalg.inv(system.matrix * INDEPENDENT + _prior(len(gains.gain), full) * INDEPENDENT)
+    covariance = np.linalg.inv(system.matrix * INDEPENDENT + gain_prior(len(gains.gain), full) * INDEPENDENT)
     return MaterialFit(gains, solution.values, work.cost(solution), spread, covariance)
 
 
@@ -296,8 +345,10 @@ def reduced_system(
     index = (free * owner[:, None, None] + np.arange(free)).repeat(3, axis=1).ravel()
     by_texel = sparse.csr_array((own.astype(float).ravel(), index, np.arange(0, 3 * o * free + 1, free)), shape=(3 * o, free * t))
     mean, precision = prior_of(samples, problem, values)
-    start = samples.observations.start[:-1]
-    normal = np.add.reduceat(np.einsum("oci,ocj->oij", own, own, dtype=float), start, axis=0)
+    # A last row of zeros, since texels without observations would take the next one's.
+    each = np.concatenate([np.einsum("oci,ocj->oij", own, own, dtype=float), np.zeros((1, free, free))])
+    normal = np.add.reduceat(each, samples.observations.start[:-1], axis=0)
+    normal[np.diff(samples.observations.start) == 0] = 0
     normal[:, np.arange(free), np.arange(free)] += precision[:, :free]
     slope = (by_texel.T @ r).reshape(t, free)
     slope -= (precision * (values - mean))[:, :free]
@@ -309,6 +360,17 @@ def reduced_system(
     return ReducedSystem(matrix, columns.T @ r - cross.T @ half)
 
 
+def slopes(problem: Problem, values: np.ndarray) -> Float[np.ndarray, " o"]:
+    """Change of each observation's radiance by a turn of the normal, per radian."""
+    total: Any = 0.0
+    for k in range(TILT.start, TILT.stop):
+        low, high = values.copy(), values.copy()
+        low[:, k] -= STEP
+        high[:, k] += STEP
+        total = total + ((problem.predict(high) - problem.predict(low)) / (2 * STEP)) ** 2
+    return np.sqrt(total.max(axis=1))
+
+
 def gain_columns(samples: MaterialSamples, predicted: Float[np.ndarray, "o 3"]) -> sparse.csr_array:
     """Derivatives of the (weighted) model by log gains and vignetting; rows are observations' channels."""
     o, n = len(predicted), samples.pictures
@@ -318,6 +380,12 @@ def gain_columns(samples: MaterialSamples, predicted: Float[np.ndarray, "o 3"]) 
     terms = np.broadcast_to(fall_terms(samples.x)[:, None, :], (o, 3, 3))
     data = predicted[..., None].astype(float) * np.concatenate([np.ones((o, 3, 1)), terms], axis=2)
     return sparse.csr_array((data.ravel(), index, np.arange(0, 12 * o + 1, 4)), shape=(3 * o, 3 * n + 3))
+
+
+def gain_terms(samples: MaterialSamples) -> Float[np.ndarray, "o k"]:
+    """Derivatives of a channel's log radiance by the pictures' log gains in it, and by the vignetting."""
+    picks = one_hot(samples.observations.picture, samples.pictures).toarray()
+    return np.concatenate([picks, fall_terms(samples.x)], axis=1)
 
 
 def texel_jacobian(
@@ -347,7 +415,7 @@ def texel_jacobian(
     return result * ~fixed[owner, None, :free]
 
 
-def _prior(n: int, full: bool) -> Float[np.ndarray, "m m"]:
+def gain_prior(n: int, full: bool) -> Float[np.ndarray, "m m"]:
     """Precision of gains and vignetting around 0."""
     third = np.full((3, 3), 1 / 3)
     own = third / EXPOSURE**2 + (np.eye(3) - third) / (BALANCE if full else FIXED) ** 2
@@ -360,7 +428,7 @@ def _prior(n: int, full: bool) -> Float[np.ndarray, "m m"]:
 def _step(system: ReducedSystem, gains: Gains, full: bool) -> Float[np.ndarray, " m"]:
     """The change of gains and vignetting; the gains of each channel keep their mean at 0."""
     n, x = len(gains.gain), np.concatenate([gains.gain.ravel(), gains.vignetting])
-    held = _prior(n, full)
+    held = gain_prior(n, full)
     level = float(np.trace(system.matrix)) / len(x)
     held[: 3 * n, : 3 * n] += level * np.kron(np.ones((n, n)), np.eye(3))
     return np.linalg.solve(system.matrix + held, system.gradient - held @ x)

@@ -71,6 +71,18 @@ class Photometry:
         return float(np.exp(self.vignetting.sum()))
 
 
+def divided(captures: Captures, gains: Gains) -> Captures:
+    """The captures divided by their gains."""
+
+    def load(k: int) -> Loaded:
+        rgb, valid = captures.load(k)
+        rgb = (rgb / gains.factor(k, captures.cameras[k])).astype(np.float32)
+        rgb.setflags(write=False)
+        return rgb, valid
+
+    return Captures(captures.cameras, captures.lights, load)
+
+
 def corrected(captures: Captures, found: Photometry) -> Captures:
     """The captures as one camera without vignetting and veil would have taken them; negative radiance becomes 0.
     Pixels of ignored cells become invalid."""
