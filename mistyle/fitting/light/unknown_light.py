@@ -28,7 +28,7 @@ from mistyle.fitting.light.solve import Bundle, State
 from mistyle.render.deferred.material_table import ALBEDO
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver import prior as recover_prior
-from mistyle.solver.photometry.material import all_samples
+from mistyle.solver.photometry.material import NOISY, all_samples
 from mistyle.solver.photometry.record import Gains
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import atlas_of, scatter, scatter_to_atlas
@@ -80,10 +80,11 @@ def find_light(
 
     traced = tracer(mesh)
     chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
-    cameras, texels, observed = _observations(traced, captures, settings, chosen)
+    noise = (NOISE, RELATIVE) if gains is None else NOISY
+    cameras, texels, observed = _observations(traced, captures, settings, chosen, noise)
     samples, own = None, None
     if gains is not None:
-        samples = all_samples(observed, cameras, (NOISE, RELATIVE))
+        samples = all_samples(observed, cameras, noise)
         own = Gains(gains.gain[chosen], gains.vignetting)
     normal = np.concatenate([t.normal[t.covered] for t in texels])
     options = Options(settings.model, settings.metallic, floor=max(FLOOR, settings.roughness_floor))
@@ -129,17 +130,21 @@ def _all_gains(gains: Gains | None, chosen: Int[np.ndarray, " k"], count: int) -
 
 
 def _observations(
-    traced: Tracer, captures: Captures, settings: RecoverSettings, chosen: Int[np.ndarray, " k"]
+    traced: Tracer,
+    captures: Captures,
+    settings: RecoverSettings,
+    chosen: Int[np.ndarray, " k"],
+    noise: tuple[float, float],
 ) -> tuple[tuple[Camera, ...], list[Texels], TexelObservations]:
     """Cameras of the chosen pictures, downsampled, and the texels' observations on a coarse atlas, as fine as
-    OBSERVATIONS allows."""
+    OBSERVATIONS allows; `noise` are the arguments of their `observation_std`."""
     from mistyle.render.deferred.image_samples import tangents_of
 
     cameras, pictures, masks = zip(*(_downsampled(captures, int(k)) for k in chosen), strict=True)
     lit = in_memory(cameras, [(Ambient((1.0, 1.0, 1.0)),)] * len(cameras), pictures, masks)
     mesh, tangents = traced.mesh, tangents_of(traced.mesh, settings.frame)
 
-    options = ObservationOptions(settings.facing, NOISE, RELATIVE, skies=False, move=0)
+    options = ObservationOptions(settings.facing, *noise, skies=False, move=0)
 
     def observed_at(side: int) -> tuple[list[Texels], TexelObservations]:
         texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
