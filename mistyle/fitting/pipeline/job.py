@@ -12,6 +12,7 @@ MATERIAL_STAGES = {
     "cameras": "place the cameras",
     "photometry": "match the exposures",
     "pictures": "check the pictures",
+    "exposures": "explain the exposures",
     "light": "solve for the light",
     "recover": "fit the material",
     "measure": "measure the fit",

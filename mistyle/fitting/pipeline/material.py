@@ -23,7 +23,7 @@ from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
-from mistyle.fitting.pipeline.photometry import match_exposures
+from mistyle.fitting.pipeline.photometry import explain_exposures, match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
@@ -117,10 +117,11 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         whole, photometry = match_exposures(run, asset, whole, shots)
         captures, notes = average_pictures(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *notes))
+        captures, photometry, light = explain_exposures(run, asset, captures, photometry)
         if job.lights == "unknown":
-            captures = with_light(run, asset, captures)
+            captures = with_light(run, asset, captures, light)
         fitted, _ = hold_out(captures, s.references)
-        after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
+        after = ["texels", "exposures", *(["light"] if job.lights == "unknown" else [])]
         recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
         complete = recovered.passes == recovered.planned
@@ -245,18 +246,18 @@ def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> 
     return read_averaged(folder, captures)
 
 
-def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
-    """The captures with an environment that is estimated together with a first material."""
+def with_light(run: Run, asset: Asset, captures: Captures, found: Any = None) -> Captures:
+    """The captures with an environment that is estimated together with a first material; `found` if it is known."""
     from mistyle.fitting.light.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
     card = [run.job.albedo_of] if run.job.albedo_of is not None else []
 
     def solved(report: Report) -> Any:
-        found = find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
-        return with_known_albedo(run, asset, captures, found)
+        first = found or find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
+        return with_known_albedo(run, asset, captures, first)
 
-    estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)
+    estimate = run.record("light", ["exposures"], [s.recover, s.light, card], solved)
     if s.light.sun and estimate.sun is None:
         run.progress.note("No direction of a sun explains the shading: the light is an environment alone.")
     return replace(captures, lights=tuple(estimate.lights for _ in captures.cameras))

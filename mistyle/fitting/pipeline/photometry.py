@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from mistyle.fitting.pipeline.job import MaterialJob
 from mistyle.io.read import read_exposure
 from mistyle.jobs.progress import Report
 from mistyle.jobs.stages import Run
-from mistyle.solver.photometry.record import Photometry, corrected, unchanged
+from mistyle.solver.photometry.record import Gains, Photometry, corrected, divided, unchanged
 
 LINEAR = (".exr", ".hdr")
 
@@ -43,6 +43,62 @@ def match_exposures(
     for text in found.notes:
         run.progress.say(text)
     return corrected(captures, found), found
+
+
+@dataclass(frozen=True)
+class MatchedPictures:
+    """The photometry of a job's pictures, the gains that its stage "exposures" added, and the light that was solved
+    with them; None where it is known or still to be solved."""
+
+    photometry: Photometry
+    gains: Gains
+    light: Any
+
+
+def explain_exposures(
+    run: Run, asset: Asset, captures: Captures, found: Photometry | None
+) -> tuple[Captures, Photometry | None, Any]:
+    """The captures at the exposures that a material explains, their photometry, and a light that was solved with them;
+    nothing changes where the stage "photometry" was left out."""
+    if found is None:
+        run.skip(["exposures"], ["pictures"])
+        return captures, None, None
+    s = run.job.settings
+    matched = run.record(
+        "exposures", ["pictures"], [s.recover, s.light, s.photometry],
+        lambda report: _explained(run.job, asset, captures, found, report),
+    )  # fmt: skip
+    for text in matched.photometry.notes:
+        run.progress.say(text)
+    return divided(captures, matched.gains), matched.photometry, matched.light
+
+
+def _explained(
+    job: MaterialJob, asset: Asset, captures: Captures, found: Photometry, report: Report
+) -> MatchedPictures:
+    from mistyle.fitting.light.unknown_light import find_light
+    from mistyle.render.deferred.image_samples import tangents_of
+    from mistyle.render.mitsuba.draw import tracer
+    from mistyle.solver.photometry.explain import explained
+    from mistyle.solver.texels.levenberg_marquardt import Options
+
+    s, n, light, start = job.settings, len(captures), None, None
+    if n < 2:
+        return MatchedPictures(found, Gains(np.zeros((n, 3)), np.zeros(3)), None)
+    if job.lights == "unknown":
+        start = Gains(np.zeros((n, 3)), np.zeros(3))
+        light = find_light(
+            asset.mesh, captures, s.recover, lambda done: report(0.7 * done), outside=s.light.sun, gains=start
+        )
+        captures, start = replace(captures, lights=(light.lights,) * n), light.gains
+    options = Options(s.recover.model, floor=s.recover.roughness_floor)
+    result = explained(
+        tracer(asset.mesh), captures, found, tangents_of(asset.mesh, s.recover.frame), options,
+        full=s.photometry.mode != "exposure", start=start, progress=lambda done: report(0.7 + 0.3 * done),
+    )  # fmt: skip
+    matched = result.photometry
+    notes = (*matched.notes, *summary(matched, 0))
+    return MatchedPictures(replace(matched, notes=notes), result.gains, light if result.solved else None)
 
 
 def _solved(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Photometry:

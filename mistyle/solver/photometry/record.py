@@ -9,7 +9,7 @@ a polynomial of second degree. Gauge: exposures have mean 0, and so have the bal
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -135,6 +135,18 @@ def veil_terms(x: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 6"]:
     """1, x, y, x², xy, y²."""
     u, v = x[..., 0], x[..., 1]
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+
+
+def with_gains(found: Photometry, gains: Gains, spread: tuple[float, float], applied: bool) -> Photometry:
+    """The photometry with further gains, in the gauge; `gains` are in the order of its names and divide the radiance,
+    and so the veil."""
+    total = gains.gain + found.exposure[:, None] + found.balance
+    common = total.mean(axis=0)
+    exposure = (total - common).mean(axis=1)
+    balance = total - common - exposure[:, None]
+    vignetting, veil = found.vignetting + gains.vignetting, found.veil * np.exp(common - gains.gain)[:, None]
+    changed = {"exposure": exposure, "balance": balance, "vignetting": vignetting, "veil": veil}
+    return replace(found, **changed, spread=spread, applied=applied)
 
 
 def unchanged(captures: Captures, notes: tuple[str, ...]) -> Photometry:
