@@ -6,8 +6,9 @@ the radiances L of the cells. Each texel's optimal step is linear in the step of
 
     sum over texels of  GᵀG - GᵀJ (JᵀJ + prior)⁻¹ JᵀG.
 
-It is solved for L >= 0 with a smoothness prior and a prior for the convention of `unknown_light.py`. Where the pictures'
-exposures are unknown too, log gains and vignetting are further columns of G (`solver/photometry/material.py`).
+It is solved for L >= 0 with a smoothness prior and a prior for the convention of `unknown_light.py`. Where the
+pictures' exposures are unknown too, log gains and vignetting are further columns of G
+(`solver/photometry/material.py`).
 Levenberg-Marquardt damping accepts only steps that lower the cost.
 """
 

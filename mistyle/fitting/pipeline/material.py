@@ -23,7 +23,7 @@ from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
-from mistyle.fitting.pipeline.photometry import explain_exposures, match_exposures
+from mistyle.fitting.pipeline.photometry import explain_exposures, match_exposures, solved_with_maps, with_maps
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
@@ -122,7 +122,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             captures = with_light(run, asset, captures, light)
         fitted, _ = hold_out(captures, s.references)
         after = ["texels", "exposures", *(["light"] if job.lights == "unknown" else [])]
-        recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
+        more = solved_with_maps(job, photometry)
+        recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after, more)
+        captures, photometry = with_maps(captures, photometry, recovered, fitted)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
         complete = recovered.passes == recovered.planned
         state = "" if complete else f"{recovered.passes} of {recovered.planned} passes"

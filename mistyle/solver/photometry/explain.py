@@ -46,7 +46,9 @@ def explained(
     start: Gains | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Explained:
-    """The photometry that a material explains best. `captures` are those of `corrected` for `found`, under known light; `start` are gains to begin at. Metallic is free
+    """The photometry that a material explains best.
+
+    `captures` are those of `corrected` for `found`, under known light; `start` are gains to begin at. Metallic is free
     whatever is fitted later. Nothing is corrected where the gains do not lower the difference between pictures and
     model to LOWER of that of the pictures as photographed.
     """

@@ -24,15 +24,15 @@ from scipy import sparse
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, shrunk
+from mistyle.core.light import has_soft
+from mistyle.core.maps import Texels
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
 from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.least_squares import one_hot
-from mistyle.core.light import has_soft
-from mistyle.core.maps import Texels
-from mistyle.solver.table import Atlas, linked
 from mistyle.solver.photometry.record import Gains, coordinates, fall_terms
 from mistyle.solver.prior import LEAST_SEEN, log_prior_penalty, metal_f0_prior, penalty
+from mistyle.solver.table import Atlas, linked
 from mistyle.solver.texels.gbuffer import open_sky, rig
 from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Points, Problem, Rig, Solution
 from mistyle.solver.texels.observations import (
@@ -58,11 +58,12 @@ STARTED, INNER = 12, 6  # Levenberg-Marquardt steps from a start, and after a ch
 RESTARTS = 2  # steps of the gains between two solves of the texels from all starts
 STEPS = 14
 FIRST_SCALE = 4.0  # of the standard deviations in the first solve
+FACING = 0.2  # least cosine of the angle of view
 DARK, LEAST = 0.01, 1e-6  # radiance of half the weight in the spread, and the least radiance in it
 SETTLED = 3e-3  # largest change of a log gain that counts as convergence
 LONGEST = 1.0  # largest change of a log gain in a step
-# Standard deviations of exposures, balances and vignetting around 0, and of those not solved for; INDEPENDENT is the share of independent
-# observations.
+# Standard deviations of exposures, balances and vignetting around 0, and of those not solved for; INDEPENDENT is the
+# share of independent observations.
 EXPOSURE, BALANCE, FALL, FIXED = 1.0, 0.2, 0.5, 1e-4
 INDEPENDENT = 0.02
 
@@ -121,7 +122,7 @@ def material_samples(
     traced: Tracer,
     captures: Captures,
     tangents: Float[np.ndarray, "f 3 4"] | None,
-    facing: float = 0.2,
+    facing: float = FACING,
     progress: Callable[[float], None] = lambda done: None,
 ) -> MaterialSamples:
     """The observations of a coarse atlas in small pictures."""
@@ -147,9 +148,7 @@ def material_samples(
     return replace(all_samples(observed, small.cameras, NOISY), regions=(observed, linked(mesh, texels)))
 
 
-def all_samples(
-    observed: TexelObservations, cameras: Sequence[Camera], noise: tuple[float, float]
-) -> MaterialSamples:
+def all_samples(observed: TexelObservations, cameras: Sequence[Camera], noise: tuple[float, float]) -> MaterialSamples:
     """All observations; `noise` are the arguments of their `observation_std`."""
     seen = observed.observations
     worth = seen.weight * observation_std(np.maximum(seen.rgb.max(axis=1, initial=0), 0), *noise)
@@ -334,7 +333,9 @@ def reduced_system(
     free = own.shape[2]
     o, t, owner = len(predicted), len(values), samples.owner
     index = (free * owner[:, None, None] + np.arange(free)).repeat(3, axis=1).ravel()
-    by_texel = sparse.csr_array((own.astype(float).ravel(), index, np.arange(0, 3 * o * free + 1, free)), shape=(3 * o, free * t))
+    by_texel = sparse.csr_array(
+        (own.astype(float).ravel(), index, np.arange(0, 3 * o * free + 1, free)), shape=(3 * o, free * t)
+    )
     mean, precision = prior_of(samples, problem, values)
     # A last row of zeros, since texels without observations would take the next one's.
     each = np.concatenate([np.einsum("oci,ocj->oij", own, own, dtype=float), np.zeros((1, free, free))])

@@ -10,7 +10,7 @@ import numpy as np
 
 from mistyle.solver.context import DirectCaptures
 from mistyle.solver.journal import Arrays, Journal
-from mistyle.solver.photometry.material import MaterialSamples, chosen_samples, solve_with_material
+from mistyle.solver.photometry.material import chosen_samples, log_gain, solve_with_material
 from mistyle.solver.photometry.record import Gains
 from mistyle.solver.schedule import MATCHED
 from mistyle.solver.table import scatter_to_atlas
@@ -19,15 +19,21 @@ from mistyle.solver.texels.observations import ImageSamples, sample_image
 from mistyle.solver.texels.solve import RoundResiduals, TexelLevel
 
 STEPS = 4  # of the gains in a pass
+LARGEST = 0.1  # log gain
 
 
 def exposures_pass(level: TexelLevel, solution: Solution, direct: DirectCaptures, journal: Journal) -> DirectCaptures:
-    """The captures with gains at which the texels of `solution` explain them better; mean log gains stay 0."""
+    """The captures with gains at which the texels of `solution` explain them better; mean log gains stay 0. The
+    captures are unchanged, with a note, where a gain would exceed LARGEST: then the maps do not explain the pictures.
+    """
     arrays = journal.part("exposures", lambda: _solved(level, solution, direct, journal))
-    gains = Gains(**arrays)
-    before = np.zeros_like(gains.gain) if direct.gains is None else direct.gains.gain
-    moved = float(np.abs(np.expm1(gains.gain - before)).max())
-    level.context.trace.setdefault("exposures.moved", []).append(moved)
+    gains, context = Gains(**arrays), level.context
+    largest = float(np.abs(gains.gain).max())
+    context.trace.setdefault("exposures.largest", []).append(largest)
+    if largest > LARGEST:
+        note = f"The exposures were not solved with the maps: one would change by {100 * np.expm1(largest):.0f} %."
+        context.notes.extend([note] * (note not in context.notes))
+        return direct
     return replace(direct, gains=gains)
 
 
@@ -49,26 +55,17 @@ def _solved(level: TexelLevel, solution: Solution, direct: DirectCaptures, journ
     samples = replace(
         samples,
         observations=replace(samples.observations, rgb=pictures),
-        defect=problem.predict(values) + residual - _corrected(samples, pictures, start),
+        defect=problem.predict(values) + residual - pictures / np.exp(log_gain(samples, start)).astype(np.float32),
         prior=(values, solution.prior[kept]),
     )
-    fit = solve_with_material(
-        samples, problem, start, full=settings.exposures == "full", values=values, steps=STEPS
-    )
+    fit = solve_with_material(samples, problem, start, full=settings.exposures == "full", values=values, steps=STEPS)
     return dict(vars(fit.gains))
-
-
-def _corrected(samples: MaterialSamples, pictures: np.ndarray, gains: Gains) -> np.ndarray:
-    from mistyle.solver.photometry.material import log_gain
-
-    return (pictures / np.exp(log_gain(samples, gains))).astype(np.float32)
 
 
 def _sampled(
     level: TexelLevel, solution: Solution, direct: DirectCaptures, rows: np.ndarray, journal: Journal
 ) -> tuple[np.ndarray, np.ndarray]:
-    """At the chosen observations: the pictures without indirect light at their own gains, and reference minus render.
-    """
+    """At the chosen observations: pictures without indirect light at their own gains, and reference minus render."""
     observed = level.observed
     table = scatter_to_atlas(solution.values, observed, level.context.atlas)
     residuals = RoundResiduals(direct, level.renderer, level.renderer.upload(table), [], journal)
