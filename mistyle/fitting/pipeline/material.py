@@ -23,7 +23,7 @@ from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
-from mistyle.fitting.pipeline.photometry import explain_exposures, match_exposures, solved_with_maps, with_maps
+from mistyle.fitting.pipeline.photometry import match_exposures, solved_with_maps, with_maps
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
@@ -114,14 +114,13 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
-        whole, photometry = match_exposures(run, asset, whole, shots)
+        whole, photometry, light = match_exposures(run, asset, whole, shots)
         captures, notes = average_pictures(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *notes))
-        captures, photometry, light = explain_exposures(run, asset, captures, photometry)
         if job.lights == "unknown":
             captures = with_light(run, asset, captures, light)
         fitted, _ = hold_out(captures, s.references)
-        after = ["texels", "exposures", *(["light"] if job.lights == "unknown" else [])]
+        after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
         more = solved_with_maps(job, photometry)
         recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after, more)
         captures, photometry = with_maps(captures, photometry, recovered, fitted)
@@ -243,7 +242,7 @@ def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> 
     """The captures at about the resolution of the texels, and notes about them."""
     average = run.job.settings.references.average
     folder = run.stage(
-        "pictures", ["texels", "photometry"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
+        "pictures", ["texels", "exposures"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
     )
     return read_averaged(folder, captures)
 
@@ -259,7 +258,7 @@ def with_light(run: Run, asset: Asset, captures: Captures, found: Any = None) ->
         first = found or find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
         return with_known_albedo(run, asset, captures, first)
 
-    estimate = run.record("light", ["exposures"], [s.recover, s.light, card], solved)
+    estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)
     if s.light.sun and estimate.sun is None:
         run.progress.note("No direction of a sun explains the shading: the light is an environment alone.")
     return replace(captures, lights=tuple(estimate.lights for _ in captures.cameras))

@@ -54,8 +54,9 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": 1 + PER_ALIGNED * len(sizes),
         **({"photometry": PHOTOMETRY_SECONDS + 1.5 * sum(sizes) * PER_READ_PIXEL} if unknown else {}),
+        **({"exposures": LIGHT_SECONDS + EXPLAINED_SECONDS} if unknown else {}),
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        **({"exposures": LIGHT_SECONDS + EXPLAINED_SECONDS, "light": 1} if unknown else {}),
+        **({"light": 1} if unknown else {}),
         "recover": recover_seconds(s, averaged, COVERED * texels, soft, shown),
         **closing_stages(s, averaged, texels, soft, shown),
     }

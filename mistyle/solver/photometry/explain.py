@@ -6,7 +6,7 @@ where a highlight that moves looks like an exposure.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -20,19 +20,16 @@ from mistyle.solver.photometry.material import (
     problem_of,
     solve_with_material,
 )
-from mistyle.solver.photometry.record import Gains, Photometry, with_gains
+from mistyle.solver.photometry.record import Gains, Photometry, gains_of, with_gains, without_gains
 from mistyle.solver.photometry.solve import AGREE, LOWER
 from mistyle.solver.texels.levenberg_marquardt import Options
 
+EXPLAINED = 0.05  # difference up to which a material without a veil shows that the veil was gloss
 
-@dataclass(frozen=True)
-class Explained:
-    """The photometry, the gains by which the captures still have to be divided, and whether these were solved with the
-    material."""
 
-    photometry: Photometry
-    gains: Gains
-    solved: bool
+def worth_explaining(found: Photometry) -> bool:
+    """False where points found a veil and still differ by far: photographs with clutter and lens flare."""
+    return not _veiled(found) or found.spread[1] < 2 * EXPLAINED
 
 
 def explained(
@@ -45,47 +42,47 @@ def explained(
     full: bool = True,
     start: Gains | None = None,
     progress: Callable[[float], None] = lambda done: None,
-) -> Explained:
-    """The photometry that a material explains best.
+) -> tuple[Photometry, bool]:
+    """The photometry that a material explains best, and whether it was solved with the material.
 
-    `captures` are those of `corrected` for `found`, under known light; `start` are gains to begin at. Metallic is free
-    whatever is fitted later. Nothing is corrected where the gains do not lower the difference between pictures and
-    model to LOWER of that of the pictures as photographed.
+    `captures` are those as photographed, under known light; `start` are gains to begin at. Metallic is free whatever is
+    fitted later. Nothing is corrected where the gains do not lower the difference between pictures and model to LOWER
+    of that of the pictures as photographed. A veil of `found` stays unless a material explains the pictures without.
     """
     samples = material_samples(traced, captures, tangents, progress=lambda done: progress(0.3 * done))
     problem, n = problem_of(samples, replace(options, metallic=True)), len(captures)
     none = Gains(np.zeros((n, 3)), np.zeros(3))
-    veiled = bool(np.abs(found.veil).max() > 0)
-    raw = none
-    if found.applied and not veiled:
-        raw = Gains(-(found.exposure[:, None] + found.balance), -found.vignetting)
-    points = fixed_gains(samples, problem, none)
-    plain = points if raw is none else fixed_gains(samples, problem, raw)
+    plain = fixed_gains(samples, problem, none)
+    points = fixed_gains(samples, problem, gains_of(found)) if found.applied else plain
     progress(0.5)
     if start is None:
-        start = raw if plain.cost < points.cost else none
+        start = min((plain, points), key=lambda each: each.cost).gains
     fit = solve_with_material(samples, problem, start, full=full)
     progress(1.0)
-    chosen = min((fit, points), key=lambda each: each.spread)
-    agree = not veiled and (chosen.spread > LOWER * plain.spread or _small(chosen, raw))
-    if agree:
+    veiled = _veiled(found)
+    if veiled and fit.spread > EXPLAINED:
+        return found, False
+    chosen = fit if veiled else min((fit, points), key=lambda each: each.spread)
+    bare = without_gains(found)
+    if chosen.spread > LOWER * plain.spread or _small(chosen.gains):
         note = "Photometry: different exposures do not explain the pictures better; nothing was corrected."
-        chosen = plain
-    else:
-        note = _note(plain, points, fit)
-    result = with_gains(found, chosen.gains, (plain.spread, chosen.spread), not agree)
-    return Explained(replace(result, notes=(note,)), chosen.gains, chosen is fit)
+        return replace(bare, spread=(plain.spread, plain.spread), notes=(note,)), False
+    result = with_gains(bare, chosen.gains, (plain.spread, chosen.spread))
+    return replace(result, notes=(_note(plain, points, fit, chosen is fit),)), chosen is fit
 
 
-def _small(fit: MaterialFit, raw: Gains) -> bool:
-    """Whether a fit's gains differ from those as photographed by less than AGREE."""
-    gain, corner = fit.gains.gain - raw.gain, (fit.gains.vignetting - raw.vignetting).sum()
-    return max(float(np.abs(gain).max()), abs(float(corner))) < AGREE
+def _veiled(found: Photometry) -> bool:
+    return bool(np.abs(found.veil).max() > 0)
 
 
-def _note(plain: MaterialFit, points: MaterialFit, fit: MaterialFit) -> str:
+def _small(gains: Gains) -> bool:
+    """Whether all gains are below AGREE."""
+    return max(float(np.abs(gains.gain).max()), abs(float(gains.vignetting.sum()))) < AGREE
+
+
+def _note(plain: MaterialFit, points: MaterialFit, fit: MaterialFit, solved: bool) -> str:
     values = [f"{100 * each.spread:.1f} %" for each in (plain, points, fit)]
-    kept = "solved with it" if fit.spread <= points.spread else "of points alone"
+    kept = "solved with it" if solved else "of points alone"
     return (
         f"Photometry: a material differs from the pictures by {values[0]} as photographed, by {values[1]} at the "
         f"exposures of points alone and by {values[2]} at those solved with it; those {kept} are used."

@@ -137,7 +137,18 @@ def veil_terms(x: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 6"]:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
-def with_gains(found: Photometry, gains: Gains, spread: tuple[float, float], applied: bool) -> Photometry:
+def gains_of(found: Photometry) -> Gains:
+    """The gains of a photometry."""
+    return Gains(found.exposure[:, None] + found.balance, found.vignetting)
+
+
+def without_gains(found: Photometry) -> Photometry:
+    """The photometry with nothing to correct; its ignored cells stay."""
+    zeros = {name: 0 * getattr(found, name) for name in ("exposure", "balance", "vignetting", "veil")}
+    return replace(found, **zeros, applied=False)
+
+
+def with_gains(found: Photometry, gains: Gains, spread: tuple[float, float]) -> Photometry:
     """The photometry with further gains, in the gauge; `gains` are in the order of its names and divide the radiance,
     and so the veil."""
     total = gains.gain + found.exposure[:, None] + found.balance
@@ -146,7 +157,7 @@ def with_gains(found: Photometry, gains: Gains, spread: tuple[float, float], app
     balance = total - common - exposure[:, None]
     vignetting, veil = found.vignetting + gains.vignetting, found.veil * np.exp(common - gains.gain)[:, None]
     changed = {"exposure": exposure, "balance": balance, "vignetting": vignetting, "veil": veil}
-    return replace(found, **changed, spread=spread, applied=applied)
+    return replace(found, **changed, spread=spread, applied=True)
 
 
 def unchanged(captures: Captures, notes: tuple[str, ...]) -> Photometry:
