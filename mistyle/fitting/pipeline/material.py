@@ -115,14 +115,13 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
         whole, photometry, light = match_exposures(run, asset, whole, shots)
-        captures, notes = average_pictures(run, texels, whole)
-        placed = replace(placed, notes=(*placed.notes, *notes))
+        captures, placed = average_pictures(run, texels, whole, placed)
         if job.lights == "unknown":
             captures = with_light(run, asset, captures, light)
         fitted, _ = hold_out(captures, s.references)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
-        more = solved_with_maps(job, photometry)
-        recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after, more)
+        some, more = subset(captures, fitted), solved_with_maps(job, photometry)
+        recovered = recovered_maps(run, asset, texels, some, after, more)
         captures, photometry = with_maps(captures, photometry, recovered, fitted)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
         complete = recovered.passes == recovered.planned
@@ -238,13 +237,14 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     return Placed(captures.cameras, captures.lights, (*notes, *warnings), figures, overlaps.overlap)
 
 
-def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
-    """The captures at about the resolution of the texels, and notes about them."""
+def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures, placed: Placed) -> tuple[Captures, Placed]:
+    """The captures at about the resolution of the texels, and `placed` with notes about them."""
     average = run.job.settings.references.average
     folder = run.stage(
         "pictures", ["texels", "exposures"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
     )
-    return read_averaged(folder, captures)
+    averaged, notes = read_averaged(folder, captures)
+    return averaged, replace(placed, notes=(*placed.notes, *notes))
 
 
 def with_light(run: Run, asset: Asset, captures: Captures, found: Any = None) -> Captures:

@@ -61,8 +61,8 @@ def match_exposures(
 
 
 def solved_with_maps(job: MaterialJob, found: Photometry | None) -> Literal["none", "exposure", "full"]:
-    """Which numbers the recovery goes on to solve: none where nothing was corrected."""
-    if found is None or not found.applied:
+    """Which numbers the recovery goes on to solve: none where nothing was corrected, or a veil was."""
+    if found is None or not found.applied or np.abs(found.veil).max() > 0:
         return "none"
     return "exposure" if job.settings.photometry.mode == "exposure" else "full"
 
@@ -98,14 +98,13 @@ def _explained(
             asset.mesh, captures, s.recover, lambda done: report(0.7 * done), outside=s.light.sun, gains=begin
         )
         captures, start = replace(captures, lights=(light.lights,) * n), light.gains
-    options, tangents = (
-        Options(s.recover.model, floor=s.recover.roughness_floor),
-        tangents_of(asset.mesh, s.recover.frame),
-    )
+    options = Options(s.recover.model, floor=s.recover.roughness_floor)
+    tangents = tangents_of(asset.mesh, s.recover.frame)
     result, solved = explained(
         tracer(asset.mesh), captures, found, tangents, options,
-        full=full, start=start, progress=lambda done: report(0.7 + 0.3 * done),
+        full=full, start=start,
     )  # fmt: skip
+    report(1.0)
     if result is not found:
         result = replace(result, notes=(*result.notes, *summary(result, 0)))
     return MatchedPictures(result, light if solved else None)

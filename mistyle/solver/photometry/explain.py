@@ -5,7 +5,6 @@ points alone gave (`solve.py`), and those solved together with the material. Poi
 where a highlight that moves looks like an exposure.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from jaxtyping import Float
 from mistyle.core.capture import Captures
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.material import (
-    MaterialFit,
+    MatchedMaterial,
     fixed_gains,
     material_samples,
     problem_of,
@@ -41,7 +40,6 @@ def explained(
     *,
     full: bool = True,
     start: Gains | None = None,
-    progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[Photometry, bool]:
     """The photometry that a material explains best, and whether it was solved with the material.
 
@@ -49,16 +47,14 @@ def explained(
     fitted later. Nothing is corrected where the gains do not lower the difference between pictures and model to LOWER
     of that of the pictures as photographed. A veil of `found` stays unless a material explains the pictures without.
     """
-    samples = material_samples(traced, captures, tangents, progress=lambda done: progress(0.3 * done))
+    samples = material_samples(traced, captures, tangents)
     problem, n = problem_of(samples, replace(options, metallic=True)), len(captures)
     none = Gains(np.zeros((n, 3)), np.zeros(3))
     plain = fixed_gains(samples, problem, none)
     points = fixed_gains(samples, problem, gains_of(found)) if found.applied else plain
-    progress(0.5)
     if start is None:
         start = min((plain, points), key=lambda each: each.cost).gains
     fit = solve_with_material(samples, problem, start, full=full)
-    progress(1.0)
     veiled = _veiled(found)
     if veiled and fit.spread > EXPLAINED:
         return found, False
@@ -80,7 +76,7 @@ def _small(gains: Gains) -> bool:
     return max(float(np.abs(gains.gain).max()), abs(float(gains.vignetting.sum()))) < AGREE
 
 
-def _note(plain: MaterialFit, points: MaterialFit, fit: MaterialFit, solved: bool) -> str:
+def _note(plain: MatchedMaterial, points: MatchedMaterial, fit: MatchedMaterial, solved: bool) -> str:
     values = [f"{100 * each.spread:.1f} %" for each in (plain, points, fit)]
     kept = "solved with it" if solved else "of points alone"
     return (

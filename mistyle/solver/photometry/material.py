@@ -98,7 +98,7 @@ class MaterialSamples:
 
 
 @dataclass(frozen=True)
-class MaterialFit:
+class MatchedMaterial:
     """Gains, the texels, the robust cost, and the robust log difference between pictures and model; `covariance` of
     gains (row by row) and vignetting."""
 
@@ -264,7 +264,7 @@ def solve_with_material(
     values: np.ndarray | None = None,
     steps: int = STEPS,
     watch: Callable[[Gains, float], None] = lambda gains, cost: None,
-) -> MaterialFit:
+) -> MatchedMaterial:
     """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures. Texels begin at
     `values`, and are solved from all starts without."""
     work, gains, fixed = _Solve(samples, problem), start, values is not None
@@ -289,20 +289,20 @@ def solve_with_material(
     return _fit_of(work, gains, work.texels(values if fixed else work.anew(values)), full)
 
 
-def fixed_gains(samples: MaterialSamples, problem: Problem, gains: Gains) -> MaterialFit:
+def fixed_gains(samples: MaterialSamples, problem: Problem, gains: Gains) -> MatchedMaterial:
     """The texels at given gains."""
     work = _Solve(samples, problem)
     work.target(gains)
     return _fit_of(work, gains, work.texels(work.anew()), True)
 
 
-def _fit_of(work: _Solve, gains: Gains, solution: Solution, full: bool) -> MaterialFit:
+def _fit_of(work: _Solve, gains: Gains, solution: Solution, full: bool) -> MatchedMaterial:
     f, y = np.maximum(work.problem.predict(solution.values), LEAST), np.maximum(work.y, LEAST)
     weight = y**2 / (y**2 + DARK**2)
     spread = 1.4826 * _weighted_median(np.abs(np.log(y / f)).ravel(), weight.ravel())
     system = reduced_system(work.samples, work.problem, solution.values, work.y, work.weight)
     covariance = np.linalg.inv(system.matrix * INDEPENDENT + gain_prior(len(gains.gain), full) * INDEPENDENT)
-    return MaterialFit(gains, solution.values, work.cost(solution), spread, covariance)
+    return MatchedMaterial(gains, solution.values, work.cost(solution), spread, covariance)
 
 
 def _weighted_median(values: np.ndarray, weight: np.ndarray) -> float:
