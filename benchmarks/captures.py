@@ -114,7 +114,7 @@ def castle_run(folder: Path, out: Path) -> CastleRun:
     work = out / "work"
     cameras = load_record(work / "cameras" / "record").cameras
     captures = replace(read_captures(folder, lights="unknown"), cameras=cameras)
-    captures = corrected(captures, load_record(work / "photometry" / "record"))
+    captures = corrected(captures, load_record(work / "exposures" / "record").photometry)
     captures, _ = read_averaged(work / "pictures", captures)
     held = tuple(k for k, picture in enumerate(record["pictures"]) if picture["held_out"])
     recovered = load_record(work / "recover" / "record")
