@@ -130,7 +130,7 @@ def castle_run(folder: Path, out: Path) -> CastleRun:
     work = out / "work"
     cameras = load_record(work / "cameras" / "record").cameras
     captures = replace(read_captures(folder, lights="unknown"), cameras=cameras)
-    captures = corrected(captures, load_record(work / "photometry" / "record"))
+    captures = corrected(captures, load_record(work / "exposures" / "record").photometry)
     captures, _ = read_averaged(work / "pictures", captures)
     held = tuple(k for k, picture in enumerate(record["pictures"]) if picture["held_out"])
     recovered = load_record(work / "recover" / "record")
@@ -262,7 +262,7 @@ def _phone(name: str, place: Path, side: int, quick: bool) -> dict[str, float]:
     run_mistyle(*words)
     result = {"seconds": time.perf_counter() - start}
     work = place / "out" / "work"
-    found, recovered = load_record(work / "photometry" / "record"), load_record(work / "recover" / "record")
+    found, recovered = load_record(work / "exposures" / "record").photometry, load_record(work / "recover" / "record")
     solved = found.exposure[:, None] + found.balance
     result["exposure_error"] = float(np.abs(np.expm1(solved - gain)).max())
     weights = [area * (count >= 3) for area, count in zip(known.areas, seen(known, cameras), strict=True)]

@@ -32,6 +32,8 @@ from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pass_state import PassState, arrays_of, state_from
+from mistyle.solver.photometry.record import Gains
+from mistyle.solver.photometry.refine import exposures_pass
 from mistyle.solver.pictures.descend import picture_pass, settled
 from mistyle.solver.schedule import FILLED, Pass, Size, schedule, shares, size_from
 from mistyle.solver.settings import RecoverSettings, descent_steps
@@ -78,6 +80,7 @@ class Recovered:
     views       number of different cameras that did
     trace       values per round and step, by name
     residuals   per picture by its name: root mean square of reference - render, relative to the reference's
+    gains       of the pictures, solved with the maps; None where `exposures` is "none"
     notes       sentences for the report
     passes      number of passes, and how many were `planned`
     """
@@ -90,6 +93,7 @@ class Recovered:
     trace: dict[str, list[float]]
     residuals: dict[str, float]
     notes: tuple[str, ...]
+    gains: Gains | None = None
     passes: int = 0
     planned: int = 0
 
@@ -178,7 +182,8 @@ def recover(
     del renderer, uploaded, work
     give_back()
     progress(1.0)
-    return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
+    done = {"gains": state.direct.gains, "passes": state.done, "planned": planned}
+    return replace(_recovered(context, estimate, table, residuals), **done)
 
 
 class _Work:
@@ -300,7 +305,7 @@ class _Work:
 
     def _prepared(self, state: PassState, one: Pass) -> PassState:
         """The state in which a pass begins: with the texels' estimate once they are solved."""
-        if one.kind in ("solve", "rounds") or state.estimate is not None:
+        if one.kind in ("solve", "rounds", "exposures") or state.estimate is not None:
             return state
         # The estimate of `state` stays in memory: a stop request during the pass writes its maps.
         prepared = replace(state, estimate=memory.away(self.estimate(state)), solution=None)
@@ -310,7 +315,10 @@ class _Work:
 
     def _after(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:
         """The state after a pass."""
-        context, journal = self.context, self.journal
+        context, journal = replace(self.context, captures=state.direct.whole()), self.journal
+        if one.kind == "exposures":
+            assert state.solution is not None
+            return replace(state, direct=exposures_pass(self.level(), state.solution, state.direct, journal))
         if one.kind == "solve":
             return replace(state, solution=first_solution(self.level(), journal, progress))
         if one.kind == "rounds":
@@ -336,7 +344,8 @@ class _Work:
             self._renderer, self._targets = renderer, None
         if self._joint is None:
             return replace(state, over=True)
-        return joint_pass(self.context, self._joint, state, one, self.journal, progress)
+        context = replace(self.context, captures=state.direct.whole())
+        return joint_pass(context, self._joint, state, one, self.journal, progress)
 
 
 def size_of(context: FitContext) -> Size:

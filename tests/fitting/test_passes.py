@@ -105,8 +105,8 @@ def test_the_command_line_takes_both_limits(shots, tmp_path, capsys):
         rows = json.loads(capsys.readouterr().out)["stages"]
         plans.append({row["stage"]: row["seconds"] for row in rows})
     assert plans[1]["recover"] < plans[0]["recover"] and sum(plans[2].values()) <= 61
-    assert list(plans[3]) == list(MATERIAL_STAGES) and plans[3]["light"] > 5
-    assert [stage for stage in MATERIAL_STAGES if stage not in plans[0]] == ["photometry", "light"]
+    assert list(plans[3]) == list(MATERIAL_STAGES) and plans[3]["exposures"] > 5
+    assert [stage for stage in MATERIAL_STAGES if stage not in plans[0]] == ["photometry", "exposures", "light"]
 
 
 def test_the_time_left_grows_by_a_quarter_at_most(monkeypatch):

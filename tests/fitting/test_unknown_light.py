@@ -125,8 +125,8 @@ def test_the_light_s_system_is_that_of_the_model(mesh, captures):
     own = bundled(mesh, captures)
     radiance = np.random.default_rng(0).uniform(0.5, 1.5, (len(own.cells.angle), 3))
     state = light_solve.texels_under(own, radiance, light_solve.first_values(own), 60)
-    matrix, gradient = light_solve._system(own, state.radiance, state.values, follow=True)
-    alone, _ = light_solve._system(own, state.radiance, state.values, follow=False)
+    matrix, gradient = light_solve._system(own, state, follow=True)
+    alone, _ = light_solve._system(own, state, follow=False)
     uphill = gradient.reshape(3, -1).T
     step = 0.005 * np.sqrt((radiance**2).mean() / (uphill**2).mean()) * uphill
     low, high = (light_solve.texels_under(own, radiance + s * step, state.values, 60).cost for s in (-1, 1))
@@ -177,7 +177,7 @@ def test_light_at_least_zero_is_the_optimum_that_scipy_finds(size):
     expected = nnls(factor.T, np.linalg.solve(factor, rhs))[0]
     assert 0 < (expected > 0).sum() < size
     for near in (np.zeros((size // 3, 3)), rng.random((size // 3, 3))):
-        found = light_solve._least_squares(matrix.copy(), rhs, near).T.ravel()
+        found = light_solve._least_squares(matrix.copy(), rhs, near)[0].T.ravel()
         np.testing.assert_allclose(found, expected, atol=1e-6 * expected.max())
 
 

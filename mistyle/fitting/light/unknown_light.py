@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, resized
@@ -28,6 +28,8 @@ from mistyle.fitting.light.solve import Bundle, State
 from mistyle.render.deferred.material_table import ALBEDO
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver import prior as recover_prior
+from mistyle.solver.photometry.material import NOISY, all_samples
+from mistyle.solver.photometry.record import Gains
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import atlas_of, scatter, scatter_to_atlas
 from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, collect_observations
@@ -44,13 +46,14 @@ BRIGHT = 0.8  # luminance of the 95th percentile of albedo
 
 @dataclass(frozen=True)
 class FoundLight:
-    """The light, the relative residual of the small pictures after each step, the coarse materials, and the sun where
-    one was asked for and is there."""
+    """The light, the relative residual of the small pictures after each step, the coarse materials, the sun where one
+    was asked for and is there, and the pictures' gains where they were solved, 0 for pictures that were left out."""
 
     light: Environment
     residuals: tuple[float, ...]
     maps: tuple[Maps, ...]
     sun: Directional | None = None
+    gains: Gains | None = None
 
     @property
     def lights(self) -> Lights:
@@ -64,9 +67,10 @@ def find_light(
     progress: Callable[[float], None] = lambda done: None,
     *,
     outside: bool = False,
+    gains: Gains | None = None,
 ) -> FoundLight:
     """One environment, fixed to the world, for all pictures; `captures.lights` are ignored. `outside` looks for
-    a sun too.
+    a sun too. `gains` are the start of the pictures' gains, which are solved too; None where they are known.
 
     Needs views from around the object. A surface without highlights determines the light only at low frequencies.
     Direct light and shadows are modelled, interreflection is not. Raises InputRefused where no texel is seen.
@@ -75,7 +79,13 @@ def find_light(
     from mistyle.solver.texels.levenberg_marquardt import Options
 
     traced = tracer(mesh)
-    texels, observed = _observations(traced, captures, settings)
+    chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
+    noise = (NOISE, RELATIVE) if gains is None else NOISY
+    cameras, texels, observed = _observations(traced, captures, settings, chosen, noise)
+    samples, own = None, None
+    if gains is not None:
+        samples = all_samples(observed, cameras, noise)
+        own = Gains(gains.gain[chosen], gains.vignetting)
     normal = np.concatenate([t.normal[t.covered] for t in texels])
     options = Options(settings.model, settings.metallic, floor=max(FLOOR, settings.roughness_floor))
     residuals: list[float] = []
@@ -85,19 +95,19 @@ def find_light(
         progress(min(0.99, len(residuals) / (sum(STEPS) + 1)))
 
     cells = light_cells.even_cells()
-    bundled = light_solve.bundle(traced, observed, normal, cells, options)
-    state = _start_state(bundled)
+    bundled = light_solve.bundle(traced, observed, normal, cells, options, samples)
+    state = _start_state(bundled, own)
     record(state)
     state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[0], record)
     cells, radiance = light_cells.refined(cells, state.radiance)
     sun = outdoors.find_sun(traced, observed, normal) if outside else None
     if sun is not None:
         cells, radiance = outdoors.with_sun(cells, radiance, sun)
-    bundled = light_solve.bundle(traced, observed, normal, cells, options)
-    values = state.values
+    bundled = light_solve.bundle(traced, observed, normal, cells, options, samples)
+    values, own = state.values, state.gains
     for _ in range(3):
-        radiance = light_solve.light_over(bundled, radiance, values)
-    state = light_solve.texels_under(bundled, radiance, values, 8)
+        radiance = light_solve.light_over(bundled, radiance, values, own)
+    state = light_solve.texels_under(bundled, radiance, values, 8, own)
     state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[1], record)
     progress(1.0)
     radiance, beam = state.radiance, None
@@ -105,21 +115,36 @@ def find_light(
         cells, radiance, beam = outdoors.without_sun(cells, radiance)
     light = light_cells.environment_of(cells, radiance)
     bright = beam if beam is not None and max(beam.irradiance) > 0 else None
-    return FoundLight(light, tuple(residuals), _maps(state, observed, texels), bright)
+    return FoundLight(
+        light, tuple(residuals), _maps(state, observed, texels), bright, _all_gains(state.gains, chosen, len(captures))
+    )
+
+
+def _all_gains(gains: Gains | None, chosen: Int[np.ndarray, " k"], count: int) -> Gains | None:
+    """The gains of the chosen pictures among all, with mean 0; 0 for the others."""
+    if gains is None:
+        return None
+    every = np.zeros((count, 3))
+    every[chosen] = gains.gain - gains.gain.mean(axis=0)
+    return Gains(every, gains.vignetting)
 
 
 def _observations(
-    traced: Tracer, captures: Captures, settings: RecoverSettings
-) -> tuple[list[Texels], TexelObservations]:
-    """The texel observations of downsampled pictures on a coarse atlas, as fine as OBSERVATIONS allows."""
+    traced: Tracer,
+    captures: Captures,
+    settings: RecoverSettings,
+    chosen: Int[np.ndarray, " k"],
+    noise: tuple[float, float],
+) -> tuple[tuple[Camera, ...], list[Texels], TexelObservations]:
+    """Cameras of the chosen pictures, downsampled, and the texels' observations on a coarse atlas, as fine as
+    OBSERVATIONS allows; `noise` are the arguments of their `observation_std`."""
     from mistyle.render.deferred.image_samples import tangents_of
 
-    chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
     cameras, pictures, masks = zip(*(_downsampled(captures, int(k)) for k in chosen), strict=True)
     lit = in_memory(cameras, [(Ambient((1.0, 1.0, 1.0)),)] * len(cameras), pictures, masks)
     mesh, tangents = traced.mesh, tangents_of(traced.mesh, settings.frame)
 
-    options = ObservationOptions(settings.facing, NOISE, RELATIVE, skies=False, move=0)
+    options = ObservationOptions(settings.facing, *noise, skies=False, move=0)
 
     def observed_at(side: int) -> tuple[list[Texels], TexelObservations]:
         texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
@@ -135,21 +160,21 @@ def _observations(
             f"found no place of the mesh that {recover_prior.LEAST_SEEN} of the pictures show, expected pictures from "
             "around it. Check the masks and the cameras (--align if their units differ from the mesh's)."
         )
-    return texels, observed
+    return cameras, texels, observed
 
 
-def _start_state(bundled: Bundle) -> State:
+def _start_state(bundled: Bundle, gains: Gains | None = None) -> State:
     """The start state: light for grey texels, then texels under that light, scaled to the convention."""
     values = light_solve.first_values(bundled)
     middle = float(np.median(bundled.observed.observations.rgb))
     radiance = np.full((len(bundled.cells.angle), 3), max(middle, 1e-6))
-    radiance = light_solve.light_over(bundled, radiance, values)
+    radiance = light_solve.light_over(bundled, radiance, values, gains)
     for _ in range(2):
-        state = light_solve.texels_under(bundled, radiance, values, 8)
+        state = light_solve.texels_under(bundled, radiance, values, 8, gains)
         factor = _factor(bundled, state)
         values, radiance = state.values.copy(), state.radiance / factor
         values[:, ALBEDO] = np.clip(values[:, ALBEDO] * factor, 0, 1)
-    return light_solve.texels_under(bundled, radiance, values, 8)
+    return light_solve.texels_under(bundled, radiance, values, 8, gains)
 
 
 def _factor(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:

@@ -11,6 +11,7 @@ MATERIAL_STAGES = {
     "texels": "rasterise the UVs",
     "cameras": "place the cameras",
     "photometry": "match the exposures",
+    "exposures": "explain the exposures",
     "pictures": "check the pictures",
     "light": "solve for the light",
     "recover": "fit the material",

@@ -24,7 +24,7 @@ from mistyle.fitting.pipeline.first_look import first_asset
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
-from mistyle.fitting.pipeline.photometry import match_exposures
+from mistyle.fitting.pipeline.photometry import match_exposures, solved_with_maps, with_maps
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
@@ -122,13 +122,14 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
         fitted, _ = hold_out(whole, s.references)
         first_asset(run, asset, texels, subset(whole, fitted))
-        whole, photometry = match_exposures(run, asset, whole, shots)
-        captures, notes = average_pictures(run, texels, whole)
-        placed = replace(placed, notes=(*placed.notes, *notes))
+        whole, photometry, light = match_exposures(run, asset, whole, shots)
+        captures, placed = average_pictures(run, texels, whole, placed)
         if job.lights == "unknown":
-            captures = with_light(run, asset, captures)
+            captures = with_light(run, asset, captures, light)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
-        recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
+        some, more = subset(captures, fitted), solved_with_maps(job, photometry)
+        recovered = recovered_maps(run, asset, texels, some, after, more)
+        captures, photometry = with_maps(captures, photometry, recovered, fitted)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
         complete = recovered.passes == recovered.planned
         state = "" if complete else f"{recovered.passes} of {recovered.planned} passes"
@@ -243,25 +244,26 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     return Placed(captures.cameras, captures.lights, (*notes, *warnings), figures, overlaps.overlap)
 
 
-def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
-    """The captures at about the resolution of the texels, and notes about them."""
+def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures, placed: Placed) -> tuple[Captures, Placed]:
+    """The captures at about the resolution of the texels, and `placed` with notes about them."""
     average = run.job.settings.references.average
     folder = run.stage(
-        "pictures", ["texels", "photometry"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
+        "pictures", ["texels", "exposures"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
     )
-    return read_averaged(folder, captures)
+    averaged, notes = read_averaged(folder, captures)
+    return averaged, replace(placed, notes=(*placed.notes, *notes))
 
 
-def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
-    """The captures with an environment that is estimated together with a first material."""
+def with_light(run: Run, asset: Asset, captures: Captures, found: Any = None) -> Captures:
+    """The captures with an environment that is estimated together with a first material; `found` if it is known."""
     from mistyle.fitting.light.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
     card = [run.job.albedo_of] if run.job.albedo_of is not None else []
 
     def solved(report: Report) -> Any:
-        found = find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
-        return with_known_albedo(run, asset, captures, found)
+        first = found or find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
+        return with_known_albedo(run, asset, captures, first)
 
     estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)
     if s.light.sun and estimate.sun is None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from mistyle.fitting.pipeline.job import MaterialJob
 from mistyle.io.read import read_exposure
 from mistyle.jobs.progress import Report
 from mistyle.jobs.stages import Run
-from mistyle.solver.photometry.record import Photometry, corrected, unchanged
+from mistyle.solver.photometry.record import Gains, Photometry, corrected, divided, unchanged, with_gains, without_gains
 
 LINEAR = (".exr", ".hdr")
 
@@ -27,22 +27,87 @@ def photometry_mode(job: MaterialJob, shots: Sequence[Any]) -> Literal["none", "
     return "full" if encoded and job.exposure is None and job.lights == "unknown" else "none"
 
 
+@dataclass(frozen=True)
+class MatchedPictures:
+    """The photometry that a material explains, and the light that was solved with it; None where it is known or still
+    to be solved."""
+
+    photometry: Photometry
+    light: Any
+
+
 def match_exposures(
     run: Run, asset: Asset, captures: Captures, shots: Sequence[Any]
-) -> tuple[Captures, Photometry | None]:
-    """The captures without their exposures, and the stage's result; None where it was left out."""
+) -> tuple[Captures, Photometry | None, Any]:
+    """The captures without their exposures, their photometry, and a light that was solved with it; None where the
+    stages were left out."""
     job = run.job
     mode = photometry_mode(job, shots)
     if mode == "none":
-        run.skip(["photometry"], ["cameras"])
-        return captures, None
+        run.skip(["photometry", "exposures"], ["cameras"])
+        return captures, None, None
     found = run.record(
         "photometry", ["cameras"], [mode, job.settings.photometry.exif],
         lambda report: _solved(job, asset, captures, shots, report),
     )  # fmt: skip
-    for text in found.notes:
+    s = job.settings
+    matched = run.record(
+        "exposures", ["photometry"], [s.recover, s.light],
+        lambda report: _explained(job, asset, captures, (found, mode == "full"), report),
+    )  # fmt: skip
+    for text in matched.photometry.notes:
         run.progress.say(text)
-    return corrected(captures, found), found
+    return corrected(captures, matched.photometry), matched.photometry, matched.light
+
+
+def solved_with_maps(job: MaterialJob, found: Photometry | None) -> Literal["none", "exposure", "full"]:
+    """Which numbers the recovery goes on to solve: none where nothing was corrected, or a veil was."""
+    if found is None or not found.applied or np.abs(found.veil).max() > 0:
+        return "none"
+    return "exposure" if job.settings.photometry.mode == "exposure" else "full"
+
+
+def with_maps(captures: Captures, found: Photometry | None, recovered: Any, fitted: Sequence[int]) -> Any:
+    """Captures and photometry after a recovery of the `fitted` pictures, whose gains it solved; the others keep
+    theirs."""
+    if found is None or recovered.gains is None:
+        return captures, found
+    every = np.zeros((len(captures), 3))
+    every[list(fitted)] = recovered.gains.gain
+    gains = Gains(every, recovered.gains.vignetting)
+    return divided(captures, gains), with_gains(found, gains, found.spread)
+
+
+def _explained(
+    job: MaterialJob, asset: Asset, captures: Captures, points: tuple[Photometry, bool], report: Report
+) -> MatchedPictures:
+    """`points`: their photometry, and whether balances and vignetting are solved too."""
+    from mistyle.fitting.light.unknown_light import find_light
+    from mistyle.render.deferred.image_samples import tangents_of
+    from mistyle.render.mitsuba.draw import tracer
+    from mistyle.solver.photometry.explain import explained, worth_explaining
+    from mistyle.solver.texels.levenberg_marquardt import Options
+
+    (found, full), s, n, light, start = points, job.settings, len(captures), None, None
+    if n < 2 or not worth_explaining(found):
+        return MatchedPictures(found, None)
+    captures = corrected(captures, without_gains(found))
+    if job.lights == "unknown":
+        begin = Gains(np.zeros((n, 3)), np.zeros(3))
+        light = find_light(
+            asset.mesh, captures, s.recover, lambda done: report(0.7 * done), outside=s.light.sun, gains=begin
+        )
+        captures, start = replace(captures, lights=(light.lights,) * n), light.gains
+    options = Options(s.recover.model, floor=s.recover.roughness_floor)
+    tangents = tangents_of(asset.mesh, s.recover.frame)
+    result, solved = explained(
+        tracer(asset.mesh), captures, found, tangents, options,
+        full=full, start=start,
+    )  # fmt: skip
+    report(1.0)
+    if result is not found:
+        result = replace(result, notes=(*result.notes, *summary(result, 0)))
+    return MatchedPictures(result, light if solved else None)
 
 
 def _solved(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Photometry:

@@ -28,6 +28,7 @@ from mistyle.solver.schedule import COVERED, FILLED, SHOWN
 
 LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pictures
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
+EXPLAINED_SECONDS = 20  # of exposures with a material
 PHOTOMETRY_SECONDS = 12  # the number of points is bounded
 
 
@@ -54,8 +55,9 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": 1 + PER_ALIGNED * len(sizes) + first_asset_seconds(sizes),
         **({"photometry": PHOTOMETRY_SECONDS + 1.5 * sum(sizes) * PER_READ_PIXEL} if unknown else {}),
+        **({"exposures": LIGHT_SECONDS + EXPLAINED_SECONDS} if unknown else {}),
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        **({"light": LIGHT_SECONDS} if unknown else {}),
+        **({"light": 1} if unknown else {}),
         "recover": recover_seconds(s, averaged, COVERED * texels, soft, shown),
         **closing_stages(s, averaged, texels, soft, shown),
     }

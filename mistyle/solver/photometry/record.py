@@ -9,7 +9,7 @@ a polynomial of second degree. Gauge: exposures have mean 0, and so have the bal
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -18,6 +18,24 @@ from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.capture import Captures, Loaded
 
 VEIL_TERMS = 6
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Log gain per picture and channel, and the vignetting's coefficients."""
+
+    gain: Float[np.ndarray, "n 3"]
+    vignetting: Float[np.ndarray, "3"]
+
+    def moved(self, change: Float[np.ndarray, " m"]) -> "Gains":
+        """The gains after a change of all of them, row by row, and of the vignetting."""
+        n = len(self.gain)
+        return Gains(self.gain + change[: 3 * n].reshape(n, 3), self.vignetting + change[3 * n :])
+
+    def factor(self, k: int, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """The gain of picture k at every pixel."""
+        fall = fall_terms(coordinates(camera, pixel_centres(camera.size))) @ self.vignetting
+        return np.exp(self.gain[k] + fall[..., None])
 
 
 @dataclass(frozen=True)
@@ -51,6 +69,18 @@ class Photometry:
     def corner(self) -> float:
         """Transmission at the picture's corner relative to the principal point."""
         return float(np.exp(self.vignetting.sum()))
+
+
+def divided(captures: Captures, gains: Gains) -> Captures:
+    """The captures divided by their gains."""
+
+    def load(k: int) -> Loaded:
+        rgb, valid = captures.load(k)
+        rgb = (rgb / gains.factor(k, captures.cameras[k])).astype(np.float32)
+        rgb.setflags(write=False)
+        return rgb, valid
+
+    return Captures(captures.cameras, captures.lights, load)
 
 
 def corrected(captures: Captures, found: Photometry) -> Captures:
@@ -105,6 +135,29 @@ def veil_terms(x: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 6"]:
     """1, x, y, x², xy, y²."""
     u, v = x[..., 0], x[..., 1]
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+
+
+def gains_of(found: Photometry) -> Gains:
+    """The gains of a photometry."""
+    return Gains(found.exposure[:, None] + found.balance, found.vignetting)
+
+
+def without_gains(found: Photometry) -> Photometry:
+    """The photometry with nothing to correct; its ignored cells stay."""
+    zeros = {name: 0 * getattr(found, name) for name in ("exposure", "balance", "vignetting", "veil")}
+    return replace(found, **zeros, applied=False)
+
+
+def with_gains(found: Photometry, gains: Gains, spread: tuple[float, float]) -> Photometry:
+    """The photometry with further gains, in the gauge; `gains` are in the order of its names and divide the radiance,
+    and so the veil."""
+    total = gains.gain + found.exposure[:, None] + found.balance
+    common = total.mean(axis=0)
+    exposure = (total - common).mean(axis=1)
+    balance = total - common - exposure[:, None]
+    vignetting, veil = found.vignetting + gains.vignetting, found.veil * np.exp(common - gains.gain)[:, None]
+    changed = {"exposure": exposure, "balance": balance, "vignetting": vignetting, "veil": veil}
+    return replace(found, **changed, spread=spread, applied=True)
 
 
 def unchanged(captures: Captures, notes: tuple[str, ...]) -> Photometry:

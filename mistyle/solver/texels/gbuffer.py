@@ -67,8 +67,8 @@ def trace_gbuffer(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> GB
     )
 
 
-def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
-    """The solver's rig of pictures and their lights; soft lights are binned into SKY_CELLS cells."""
+def rig(cameras: Sequence[Camera], lights: Sequence[Lights], count: int = SKY_CELLS) -> Rig:
+    """The solver's rig of pictures and their lights; soft lights are binned into `count` cells."""
     vector, near, irradiance, width2 = [], [], [], []
     first, cells, known = [0], [], {}
     for camera, own in zip(cameras, lights, strict=True):
@@ -90,11 +90,11 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
         if soft:
             key = tuple(map(id, soft))
             if key not in known:
-                known[key] = bin_environment(soft, even_directions(SKY_CELLS))
+                known[key] = bin_environment(soft, even_directions(count))
             sky = known[key]
             vector.extend(sky.direction)
             irradiance.extend(sky.irradiance)
-            near.extend([0.0] * SKY_CELLS)
+            near.extend([0.0] * count)
             width2.extend(sky.width2)
         first.append(len(near))
     return Rig(

@@ -161,15 +161,17 @@ def solution_after_rounds(
     The solver restarts with each estimate: indirect light can shift roughness and metallic into a local minimum, where
     they would stay otherwise.
     """
-    (solution, whole), context, problem, atlas = start, level.context, level.problem, level.context.atlas
+    (solution, whole), problem, atlas = start, level.problem, level.context.atlas
+    direct = replace(whole, captures=level.context.captures)
+    context = replace(level.context, captures=direct.whole())
     assert problem is not None
-    direct = replace(whole, captures=context.captures)
     if one.samples:
         table = scatter_to_atlas(solution.values, level.observed, atlas)
         sampling = one.samples, context.seed + one.begin
         for k, light, _ in journalled_light(context, level.renderer, table, sampling, journal, progress.part(0, 0.4)):
             direct = direct.with_indirect(k, light)
-    observed = observed_direct(level.observed, direct) if direct.indirect else level.observed
+    known = direct.indirect or direct.gains is not None
+    observed = observed_direct(level.observed, direct) if known else level.observed
     if one.samples:
         problem.reweight(observed.observations.weight)
         problem.retarget(observed.observations.rgb)

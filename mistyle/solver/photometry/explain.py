@@ -1,0 +1,85 @@
+"""Which gains of a set of pictures a material explains best, under known light.
+
+Three candidates are compared with the same material model (`material.py`): the pictures as photographed, the gains that
+points alone gave (`solve.py`), and those solved together with the material. Points alone fail on metals and dark gloss,
+where a highlight that moves looks like an exposure.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.capture import Captures
+from mistyle.render.mitsuba.draw import Tracer
+from mistyle.solver.photometry.material import (
+    MatchedMaterial,
+    fixed_gains,
+    material_samples,
+    problem_of,
+    solve_with_material,
+)
+from mistyle.solver.photometry.record import Gains, Photometry, gains_of, with_gains, without_gains
+from mistyle.solver.photometry.solve import AGREE, LOWER
+from mistyle.solver.texels.levenberg_marquardt import Options
+
+EXPLAINED = 0.05  # difference up to which a material without a veil shows that the veil was gloss
+
+
+def worth_explaining(found: Photometry) -> bool:
+    """False where points found a veil and still differ by far: photographs with clutter and lens flare."""
+    return not _veiled(found) or found.spread[1] < 2 * EXPLAINED
+
+
+def explained(
+    traced: Tracer,
+    captures: Captures,
+    found: Photometry,
+    tangents: Float[np.ndarray, "f 3 4"] | None,
+    options: Options,
+    *,
+    full: bool = True,
+    start: Gains | None = None,
+) -> tuple[Photometry, bool]:
+    """The photometry that a material explains best, and whether it was solved with the material.
+
+    `captures` are those as photographed, under known light; `start` are gains to begin at. Metallic is free whatever is
+    fitted later. Nothing is corrected where the gains do not lower the difference between pictures and model to LOWER
+    of that of the pictures as photographed. A veil of `found` stays unless a material explains the pictures without.
+    """
+    samples = material_samples(traced, captures, tangents)
+    problem, n = problem_of(samples, replace(options, metallic=True)), len(captures)
+    none = Gains(np.zeros((n, 3)), np.zeros(3))
+    plain = fixed_gains(samples, problem, none)
+    points = fixed_gains(samples, problem, gains_of(found)) if found.applied else plain
+    if start is None:
+        start = min((plain, points), key=lambda each: each.cost).gains
+    fit = solve_with_material(samples, problem, start, full=full)
+    veiled = _veiled(found)
+    if veiled and fit.spread > EXPLAINED:
+        return found, False
+    chosen = fit if veiled else min((fit, points), key=lambda each: each.spread)
+    bare = without_gains(found)
+    if chosen.spread > LOWER * plain.spread or _small(chosen.gains):
+        note = "Photometry: different exposures do not explain the pictures better; nothing was corrected."
+        return replace(bare, spread=(plain.spread, plain.spread), notes=(note,)), False
+    result = with_gains(bare, chosen.gains, (plain.spread, chosen.spread))
+    return replace(result, notes=(_note(plain, points, fit, chosen is fit),)), chosen is fit
+
+
+def _veiled(found: Photometry) -> bool:
+    return bool(np.abs(found.veil).max() > 0)
+
+
+def _small(gains: Gains) -> bool:
+    """Whether all gains are below AGREE."""
+    return max(float(np.abs(gains.gain).max()), abs(float(gains.vignetting.sum()))) < AGREE
+
+
+def _note(plain: MatchedMaterial, points: MatchedMaterial, fit: MatchedMaterial, solved: bool) -> str:
+    values = [f"{100 * each.spread:.1f} %" for each in (plain, points, fit)]
+    kept = "solved with it" if solved else "of points alone"
+    return (
+        f"Photometry: a material differs from the pictures by {values[0]} as photographed, by {values[1]} at the "
+        f"exposures of points alone and by {values[2]} at those solved with it; those {kept} are used."
+    )
