@@ -122,10 +122,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
         fitted, _ = hold_out(whole, s.references)
         first_asset(run, asset, texels, subset(whole, fitted))
-        whole, photometry, light = match_exposures(run, asset, whole, shots)
-        captures, placed = average_pictures(run, texels, whole, placed)
-        if job.lights == "unknown":
-            captures = with_light(run, asset, captures, light)
+        captures, placed, photometry = explained_pictures(run, asset, texels, (whole, placed), shots)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
         some, more = subset(captures, fitted), solved_with_maps(job, photometry)
         recovered = recovered_maps(run, asset, texels, some, after, more)
@@ -147,6 +144,18 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             inputs = [s.report, job.name]
             run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, results, progress, r))
         return deliver(job, progress) | write_summary(results, run)
+
+
+def explained_pictures(
+    run: Run, asset: Asset, texels: Sequence[Texels], whole: tuple[Captures, Placed], shots: Sequence[Any]
+) -> tuple[Captures, Placed, Photometry | None]:
+    """The pictures at the resolution of the texels, with their light, less their exposures; `placed` with notes about
+    them; and their photometry."""
+    captures, photometry, light = match_exposures(run, asset, whole[0], shots)
+    captures, placed = average_pictures(run, texels, captures, whole[1])
+    if run.job.lights == "unknown":
+        captures = with_light(run, asset, captures, light)
+    return captures, placed, photometry
 
 
 def inputs_of(job: MaterialJob) -> list[Path]:
