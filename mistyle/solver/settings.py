@@ -146,7 +146,7 @@ class RecoverSettings(BaseModel):
     exposures: Literal["none", "exposure", "full"] = Field(
         default="none",
         description="solve for each picture's exposure, or (full) also its white balance and the vignetting of all, "
-        "between rounds; --photometry sets it",
+        "between rounds, where --photometry corrected the pictures; on a coarse, glossy atlas it made them worse",
     )
     polish: int = Field(
         default=0,

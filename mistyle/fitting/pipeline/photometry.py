@@ -61,10 +61,10 @@ def match_exposures(
 
 
 def solved_with_maps(job: MaterialJob, found: Photometry | None) -> Literal["none", "exposure", "full"]:
-    """Which numbers the recovery goes on to solve: none where nothing was corrected, or a veil was."""
+    """`recover.exposures`; "none" where nothing was corrected, or a veil was."""
     if found is None or not found.applied or np.abs(found.veil).max() > 0:
         return "none"
-    return "exposure" if job.settings.photometry.mode == "exposure" else "full"
+    return job.settings.recover.exposures
 
 
 def with_maps(captures: Captures, found: Photometry | None, recovered: Any, fitted: Sequence[int]) -> Any:
