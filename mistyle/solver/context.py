@@ -13,7 +13,6 @@ from mistyle.core.light import has_soft
 from mistyle.core.maps import Texels
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.indirect import enlarged
-from mistyle.solver.photometry.record import Gains, divided
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import Atlas
 
@@ -70,24 +69,18 @@ class FitContext:
 
 @dataclass(frozen=True)
 class DirectCaptures:
-    """Reference pictures, their estimated indirect light (linear radiance per picture, possibly coarser), and their
-    gains; None without."""
+    """Reference pictures, and their estimated indirect light: linear radiance per picture, possibly coarser."""
 
     captures: Captures
     indirect: Mapping[int, Radiance] = field(default_factory=dict)
-    gains: Gains | None = None
 
     def with_indirect(self, k: int, light: Radiance) -> "DirectCaptures":
         """A copy with another estimate for picture k."""
         return replace(self, indirect={**self.indirect, k: light})
 
-    def whole(self) -> Captures:
-        """The pictures with all their light, without their gains."""
-        return self.captures if self.gains is None else divided(self.captures, self.gains)
-
     def load(self, k: int) -> Loaded:
         """Picture k less its indirect light, and its mask of valid pixels."""
-        rgb, mask = self.whole().load(k)
+        rgb, mask = self.captures.load(k)
         if k in self.indirect:
             rgb = rgb - self.enlarged(k)
         return rgb, mask

@@ -7,7 +7,6 @@ import numpy as np
 from mistyle.render.deferred.material_table import MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.journal import Arrays, text_array, text_value
-from mistyle.solver.photometry.record import Gains
 from mistyle.solver.texels.records import Solution
 from mistyle.solver.texels.solve import TexelEstimate
 
@@ -16,7 +15,7 @@ from mistyle.solver.texels.solve import TexelEstimate
 class PassState:
     """After `done` passes.
 
-    direct    the references without their estimated indirect light and their gains
+    direct    the references without their estimated indirect light
     solution  of the per-texel solver, while its passes last
     estimate  its result at the atlas's resolution, after them
     table     after passes on whole pictures; `settled` once they have ended and been accepted or undone
@@ -37,8 +36,6 @@ def arrays_of(state: PassState, context: FitContext) -> Arrays:
     words = {name: getattr(state, name) for name in ("done", "settled", "over")}
     flat: Arrays = {"words": text_array(words | {"notes": context.notes, "trace": context.trace})}
     flat |= {f"indirect.{k}": light for k, light in state.direct.indirect.items()}
-    if state.direct.gains is not None:
-        flat |= {f"gains.{name}": value for name, value in vars(state.direct.gains).items()}
     for name in ("solution", "estimate"):
         record = getattr(state, name)
         if record is not None:
@@ -52,8 +49,7 @@ def state_from(arrays: Arrays, context: FitContext) -> PassState:
     context.notes[:] = words["notes"]
     context.trace.clear()
     context.trace.update(words["trace"])
-    gains = _inside(arrays, "gains.")
-    direct = DirectCaptures(context.captures, gains=Gains(**gains) if gains else None)
+    direct = DirectCaptures(context.captures)
     for name, light in arrays.items():
         if name.startswith("indirect."):
             direct = direct.with_indirect(int(name.split(".")[1]), light)

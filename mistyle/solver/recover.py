@@ -32,8 +32,6 @@ from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pass_state import PassState, arrays_of, state_from
-from mistyle.solver.photometry.record import Gains
-from mistyle.solver.photometry.refine import exposures_pass
 from mistyle.solver.pictures.descend import picture_pass, settled
 from mistyle.solver.schedule import FILLED, Pass, Size, schedule, shares, size_from
 from mistyle.solver.settings import RecoverSettings, descent_steps
@@ -80,7 +78,6 @@ class Recovered:
     views       number of different cameras that did
     trace       values per round and step, by name
     residuals   per picture by its name: root mean square of reference - render, relative to the reference's
-    gains       of the pictures, solved with the maps; None where `exposures` is "none"
     notes       sentences for the report
     passes      number of passes, and how many were `planned`
     """
@@ -93,7 +90,6 @@ class Recovered:
     trace: dict[str, list[float]]
     residuals: dict[str, float]
     notes: tuple[str, ...]
-    gains: Gains | None = None
     passes: int = 0
     planned: int = 0
 
@@ -182,8 +178,7 @@ def recover(
     del renderer, uploaded, work
     give_back()
     progress(1.0)
-    done = {"gains": state.direct.gains, "passes": state.done, "planned": planned}
-    return replace(_recovered(context, estimate, table, residuals), **done)
+    return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
 
 
 class _Work:
@@ -305,7 +300,7 @@ class _Work:
 
     def _prepared(self, state: PassState, one: Pass) -> PassState:
         """The state in which a pass begins: with the texels' estimate once they are solved."""
-        if one.kind in ("solve", "rounds", "exposures") or state.estimate is not None:
+        if one.kind in ("solve", "rounds") or state.estimate is not None:
             return state
         # The estimate of `state` stays in memory: a stop request during the pass writes its maps.
         prepared = replace(state, estimate=memory.away(self.estimate(state)), solution=None)
@@ -315,10 +310,7 @@ class _Work:
 
     def _after(self, state: PassState, one: Pass, progress: StageProgress) -> PassState:
         """The state after a pass."""
-        context, journal = replace(self.context, captures=state.direct.whole()), self.journal
-        if one.kind == "exposures":
-            assert state.solution is not None
-            return replace(state, direct=exposures_pass(self.level(), state.solution, state.direct, journal))
+        context, journal = self.context, self.journal
         if one.kind == "solve":
             return replace(state, solution=first_solution(self.level(), journal, progress))
         if one.kind == "rounds":
@@ -344,8 +336,7 @@ class _Work:
             self._renderer, self._targets = renderer, None
         if self._joint is None:
             return replace(state, over=True)
-        context = replace(self.context, captures=state.direct.whole())
-        return joint_pass(context, self._joint, state, one, self.journal, progress)
+        return joint_pass(self.context, self._joint, state, one, self.journal, progress)
 
 
 def size_of(context: FitContext) -> Size:

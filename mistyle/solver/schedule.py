@@ -19,7 +19,7 @@ from mistyle.solver.settings import (
     passes,
 )
 
-Kind = Literal["solve", "rounds", "exposures", "pictures", "joint", "polish"]
+Kind = Literal["solve", "rounds", "pictures", "joint", "polish"]
 STARTS, RESTARTED, CONTINUED = 3, 37, 5  # starts of a solve; steps of a round with restarts, and of one without
 SOFT_COST = 16  # approximate run time of a texel under a sky, relative to one light
 SKY_CELLS = 128
@@ -34,7 +34,6 @@ LARGE = 4_000_000  # pixels of a picture from which it is averaged for a coarser
 WHOLE, JOINT_TEXEL, JOINT_PIXEL = 2**22, 750, 240
 JUDGES = 48  # pictures whose loss accepts or rejects the steps on whole pictures
 RESTARTS = 3  # rounds in which texels also start from their neighbours' values
-EXPOSURES = 4  # most passes over the pictures' exposures
 CLASS_ROUNDS = 2  # rounds after each solve from the start in which metal and dielectric are both tried
 
 # Seconds of two cores, per unit named; those of soft light are of one of its cells.
@@ -46,7 +45,6 @@ GRADIENT = 2.9  # a step's cost over that of a picture
 PER_VISIBILITY = 1.3e-8  # a sample and a cell, once
 PER_PATH, PER_SOFT_PATH = 1.2e-7, 3e-7  # a path of indirect light
 PER_SMOOTHED = 1.5e-5  # a covered texel in one smoothing pass
-MATCHED, MATCHING = 100_000, 200  # observations, and steps of the per-texel solver, of a pass over exposures
 PER_JOINT = 3e-6  # a sample in a joint step
 PER_DETAIL = 4e-6  # a covered texel in a picture, for the albedo's detail
 
@@ -91,8 +89,6 @@ def schedule(settings: RecoverSettings, pictures: int, solved: bool) -> list[Pas
         result.append(Pass("solve", anew=True))
         for k, begin in enumerate(range(0, all_rounds(settings, pictures), max(rounds, 1))):
             samples = among[k - 1] if 0 < k <= len(among) else 0
-            if settings.exposures != "none" and k < EXPOSURES:
-                result.append(Pass("exposures", k))
             result.append(Pass("rounds", begin, rounds, samples, samples > 0))
     if descends:
         begin = 0
@@ -181,15 +177,13 @@ def _collecting(settings: RecoverSettings, size: Size, samples: float) -> float:
 def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     """Approximate seconds of a pass."""
     render, again = _rendering(settings, size), _collecting(settings, size, size.samples)
-    if one.kind in ("solve", "rounds", "exposures"):
+    if one.kind in ("solve", "rounds"):
         render *= size.rough / size.samples
         render += _collecting(settings, size, size.rough)
     step = size.observations * (PER_CELL * size.cells if size.cells else PER_OBSERVATION)
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
     total = one.samples * size.paths * (PER_SOFT_PATH if size.cells else PER_PATH) + (render if one.samples else 0)
     metals = 2 if settings.metallic else 1
-    if one.kind == "exposures":
-        total += render + min(size.observations, MATCHED) / size.observations * MATCHING * step
     if one.anew:
         total += STARTS * metals * settings.solver_iterations * step
     if one.kind == "rounds":

@@ -143,11 +143,6 @@ class RecoverSettings(BaseModel):
         description="samples a pixel in those steps, a square number: with 9, which undersample a pixel's "
         "edges and texture, a helmet's normals had an error of 0.42° under direct light, with 25 of 0.34°",
     )
-    exposures: Literal["none", "exposure", "full"] = Field(
-        default="none",
-        description="solve for each picture's exposure, or (full) also its white balance and the vignetting of all, "
-        "between rounds, where --photometry corrected the pictures; on a coarse, glossy atlas it made them worse",
-    )
     polish: int = Field(
         default=0,
         ge=0,

@@ -24,7 +24,7 @@ from mistyle.fitting.pipeline.first_look import first_asset
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
-from mistyle.fitting.pipeline.photometry import match_exposures, solved_with_maps, with_maps
+from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
@@ -124,9 +124,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         first_asset(run, asset, texels, subset(whole, fitted))
         captures, placed, photometry = explained_pictures(run, asset, texels, (whole, placed), shots)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
-        some, more = subset(captures, fitted), solved_with_maps(job, photometry)
-        recovered = recovered_maps(run, asset, texels, some, after, more)
-        captures, photometry = with_maps(captures, photometry, recovered, fitted)
+        recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
         complete = recovered.passes == recovered.planned
         state = "" if complete else f"{recovered.passes} of {recovered.planned} passes"

@@ -30,19 +30,13 @@ from mistyle.jobs.stages import Run
 OFTEN = 2.0  # factor of the time since the start between two assets
 
 
-def recovered_maps(
-    run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, after: Sequence[str], exposures: str
-) -> Any:
-    """The stage's `Recovered`. Its checkpoint does not depend on the limits, so wider ones continue from it.
-    `exposures`: which of them are solved with the maps."""
+def recovered_maps(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, after: Sequence[str]) -> Any:
+    """The stage's `Recovered`. Its checkpoint does not depend on the limits, so wider ones continue from it."""
     s: MaterialSettings = run.job.settings
     inputs = [s.recover, s.references, s.start, s.seed]
     key = digest([run.base, "recover", inputs, [run.keys[name] for name in after]])
     recovered = run.record(
-        "recover",
-        after,
-        [*inputs, s.passes, s.minutes],
-        lambda r: solve(run, asset, texels, captures, key, r, exposures),
+        "recover", after, [*inputs, s.passes, s.minutes], lambda r: solve(run, asset, texels, captures, key, r)
     )
     if recovered.passes == recovered.planned:
         checkpoint.clear(run.job.out)
@@ -54,15 +48,7 @@ def recovered_maps(
     return recovered
 
 
-def solve(
-    run: Run,
-    asset: Asset,
-    texels: Sequence[Texels],
-    captures: Captures,
-    key: str,
-    report: StageReport,
-    exposures: str = "none",
-) -> Any:
+def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, key: str, report: StageReport) -> Any:
     """The fit, with checkpoints in work/ under `key`, so that another job's checkpoint is never resumed."""
     from mistyle.atlas.texels import start_maps
     from mistyle.solver.recover import Checkpoints, Limits, Reached, recover, shown_in
@@ -75,7 +61,6 @@ def solve(
     # The cache of the pictures' samples changes only the time of the fit.
     unaveraged = with_setting(s, "references.average", 1)  # the pictures are averaged already
     bounded = check_material(unaveraged, pixels_of(captures), *size_of(asset))
-    chosen = bounded.recover.model_copy(update={"exposures": exposures})
     last: list[Reached] = []
     written = [since]
 
@@ -98,7 +83,7 @@ def solve(
     report.end_in(deadline - time.monotonic())
     try:
         return recover(
-            asset.mesh, texels, captures, chosen, s.seed, report,
+            asset.mesh, texels, captures, bounded.recover, s.seed, report,
             start=start, checkpoints=checkpoints, limits=limits,
         )  # fmt: skip
     except Stopped:

@@ -13,7 +13,7 @@ from mistyle.fitting.pipeline.job import MaterialJob
 from mistyle.io.read import read_exposure
 from mistyle.jobs.progress import Report
 from mistyle.jobs.stages import Run
-from mistyle.solver.photometry.record import Gains, Photometry, corrected, divided, unchanged, with_gains, without_gains
+from mistyle.solver.photometry.record import Gains, Photometry, corrected, unchanged, without_gains
 
 LINEAR = (".exr", ".hdr")
 
@@ -58,24 +58,6 @@ def match_exposures(
     for text in matched.photometry.notes:
         run.progress.say(text)
     return corrected(captures, matched.photometry), matched.photometry, matched.light
-
-
-def solved_with_maps(job: MaterialJob, found: Photometry | None) -> Literal["none", "exposure", "full"]:
-    """`recover.exposures`; "none" where nothing was corrected, or a veil was."""
-    if found is None or not found.applied or np.abs(found.veil).max() > 0:
-        return "none"
-    return job.settings.recover.exposures
-
-
-def with_maps(captures: Captures, found: Photometry | None, recovered: Any, fitted: Sequence[int]) -> Any:
-    """Captures and photometry after a recovery of the `fitted` pictures, whose gains it solved; the others keep
-    theirs."""
-    if found is None or recovered.gains is None:
-        return captures, found
-    every = np.zeros((len(captures), 3))
-    every[list(fitted)] = recovered.gains.gain
-    gains = Gains(every, recovered.gains.vignetting)
-    return divided(captures, gains), with_gains(found, gains, found.spread)
 
 
 def _explained(

@@ -31,7 +31,7 @@ from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.least_squares import one_hot
 from mistyle.solver.photometry.record import Gains, coordinates, fall_terms
-from mistyle.solver.prior import LEAST_SEEN, log_prior_penalty, metal_f0_prior, penalty
+from mistyle.solver.prior import log_prior_penalty, metal_f0_prior, penalty
 from mistyle.solver.table import Atlas, linked
 from mistyle.solver.texels.gbuffer import open_sky, rig
 from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Points, Problem, Rig, Solution
@@ -71,11 +71,7 @@ INDEPENDENT = 0.02
 @dataclass(frozen=True)
 class MaterialSamples:
     """o observations of t texels in n pictures; `x` is the position in the picture (`record.coordinates`), `worth` the
-    observation's weight times its standard deviation, 0..1, `noise` the arguments of `observation_std`.
-
-    `defect` is added to the corrected radiance (defect correction, `texels/rounds.py`), and `prior` is the mean and the
-    precision of the texels; None for 0 and for MEAN and SPREAD.
-    """
+    observation's weight times its standard deviation, 0..1, `noise` the arguments of `observation_std`."""
 
     points: Points
     rig: Rig
@@ -83,8 +79,6 @@ class MaterialSamples:
     x: Float[np.ndarray, "o 2"]
     worth: Float[np.ndarray, " o"]
     noise: tuple[float, float]
-    defect: Float[np.ndarray, "o 3"] | None = None
-    prior: tuple[Float[np.ndarray, "t 7"], Float[np.ndarray, "t 7"]] | None = None
     regions: tuple[TexelObservations, Atlas] | None = None
 
     @property
@@ -156,23 +150,6 @@ def all_samples(observed: TexelObservations, cameras: Sequence[Camera], noise: t
     return MaterialSamples(observed.points, observed.rig, seen, x, worth.astype(np.float32), noise)
 
 
-def chosen_samples(
-    observed: TexelObservations, cameras: Sequence[Camera], noise: tuple[float, float], most: float, seed: int
-) -> tuple[MaterialSamples, Int[np.ndarray, " t"], Int[np.ndarray, " o"]]:
-    """Texels with at least LEAST_SEEN observations, chosen at random for about `most` of them; and the rows of texels
-    and observations."""
-    whole, count = all_samples(observed, cameras, noise), observed.seen
-    seen, p = whole.observations, whole.points
-    usable = count >= LEAST_SEEN
-    share = most / max(int(count[usable].sum()), 1)
-    kept = np.flatnonzero(usable & (np.random.default_rng(seed).random(len(count)) < share))
-    rows = np.flatnonzero(np.repeat(np.isin(np.arange(len(count)), kept), count))
-    start = np.concatenate([[0], np.cumsum(count[kept])])
-    own = Observations(start, seen.picture[rows], seen.rgb[rows], seen.weight[rows], seen.lit[rows])
-    points = Points(p.position[kept], p.frame[kept], None if p.open is None else p.open[kept])
-    return MaterialSamples(points, whole.rig, own, whole.x[rows], whole.worth[rows], noise), kept, rows
-
-
 def problem_of(samples: MaterialSamples, options: Options) -> Problem:
     """The per-texel solver of the samples."""
     return Problem(samples.points, samples.rig, samples.observations, options)
@@ -188,8 +165,6 @@ def corrected_samples(
 ) -> tuple[Float[np.ndarray, "o 3"], Float[np.ndarray, " o"]]:
     """The observations without their gains, and their weights."""
     y = (samples.observations.rgb / np.exp(log_gain(samples, gains))).astype(np.float32)
-    if samples.defect is not None:
-        y += samples.defect
     level = np.maximum(y.max(axis=1, initial=0), 0)
     return y, (samples.worth / observation_std(level, *samples.noise)).astype(np.float32)
 
@@ -210,7 +185,7 @@ class _Solve:
 
     def texels(self, values: np.ndarray, steps: int = INNER) -> Solution:
         """The texels from `values`, in their classes."""
-        return self.problem.solve(values, *prior_of(self.samples, self.problem, values), steps)
+        return self.problem.solve(values, *prior_of(self.problem, values), steps)
 
     def anew(self, values: np.ndarray | None = None) -> np.ndarray:
         """The best of all starts and of `values`."""
@@ -224,7 +199,7 @@ class _Solve:
                 starts.append(guess)
         for guess in starts:
             solution = self.texels(guess, STARTED)
-            extra = penalty(solution.values, *prior_of(self.samples, self.problem, guess))
+            extra = penalty(solution.values, *prior_of(self.problem, guess))
             if metallic:
                 extra = extra + log_prior_penalty(solution.values, seen, "metal")
             tries.append((solution, extra))
@@ -234,7 +209,7 @@ class _Solve:
 
     def cost(self, solution: Solution) -> float:
         """Robust cost and prior of all texels."""
-        extra = penalty(solution.values, *prior_of(self.samples, self.problem, solution.values))
+        extra = penalty(solution.values, *prior_of(self.problem, solution.values))
         return float((solution.cost + extra).sum(dtype=np.float64))
 
     def residual(self, values: np.ndarray) -> float:
@@ -243,10 +218,8 @@ class _Solve:
         return float(np.median(np.sqrt((residual**2).sum(axis=1)))) * self.scale
 
 
-def prior_of(samples: MaterialSamples, problem: Problem, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and precision of texels: those of the samples, else MEAN and SPREAD, and those of the class of `values`."""
-    if samples.prior is not None:
-        return samples.prior
+def prior_of(problem: Problem, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and precision of texels: MEAN and SPREAD, and those of the class of `values`."""
     mean = np.tile(np.array(MEAN, np.float32), (len(values), 1))
     precision = np.tile(1 / np.array(SPREAD, np.float32) ** 2, (len(values), 1)).astype(np.float32)
     if not problem.options.metallic:
@@ -261,32 +234,26 @@ def solve_with_material(
     start: Gains,
     *,
     full: bool = True,
-    values: np.ndarray | None = None,
-    steps: int = STEPS,
-    watch: Callable[[Gains, float], None] = lambda gains, cost: None,
 ) -> MatchedMaterial:
-    """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures. Texels begin at
-    `values`, and are solved from all starts without."""
-    work, gains, fixed = _Solve(samples, problem), start, values is not None
-    work.scale = 1.0 if fixed else FIRST_SCALE
+    """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures."""
+    work, gains = _Solve(samples, problem), start
+    work.scale = FIRST_SCALE
     work.target(gains)
-    values = work.anew() if values is None else values
-    for k in range(steps):
+    values = work.anew()
+    for k in range(STEPS):
         work.scale = max(1.0, work.residual(values) / USUAL)
         work.target(gains)
-        values = work.texels(values).values if fixed or k % RESTARTS else work.anew(values)
+        values = work.texels(values).values if k % RESTARTS else work.anew(values)
         system = reduced_system(samples, problem, values, work.y, work.weight)
         change = np.clip(_step(system, gains, full), -LONGEST, LONGEST)
         gains = gains.moved(change)
         work.target(gains)
-        solution = work.texels(values)
-        values = solution.values
-        watch(gains, work.cost(solution))
-        if np.abs(change).max() < SETTLED and (fixed or k % RESTARTS == 0):
+        values = work.texels(values).values
+        if np.abs(change).max() < SETTLED and k % RESTARTS == 0:
             break
     work.scale = 1.0
     work.target(gains)
-    return _fit_of(work, gains, work.texels(values if fixed else work.anew(values)), full)
+    return _fit_of(work, gains, work.texels(work.anew(values)), full)
 
 
 def fixed_gains(samples: MaterialSamples, problem: Problem, gains: Gains) -> MatchedMaterial:
@@ -336,7 +303,7 @@ def reduced_system(
     by_texel = sparse.csr_array(
         (own.astype(float).ravel(), index, np.arange(0, 3 * o * free + 1, free)), shape=(3 * o, free * t)
     )
-    mean, precision = prior_of(samples, problem, values)
+    mean, precision = prior_of(problem, values)
     # A last row of zeros, since texels without observations would take the next one's.
     each = np.concatenate([np.einsum("oci,ocj->oij", own, own, dtype=float), np.zeros((1, free, free))])
     normal = np.add.reduceat(each, samples.observations.start[:-1], axis=0)

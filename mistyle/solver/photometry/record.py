@@ -32,11 +32,6 @@ class Gains:
         n = len(self.gain)
         return Gains(self.gain + change[: 3 * n].reshape(n, 3), self.vignetting + change[3 * n :])
 
-    def factor(self, k: int, camera: Camera) -> Float[np.ndarray, "h w 3"]:
-        """The gain of picture k at every pixel."""
-        fall = fall_terms(coordinates(camera, pixel_centres(camera.size))) @ self.vignetting
-        return np.exp(self.gain[k] + fall[..., None])
-
 
 @dataclass(frozen=True)
 class Photometry:
@@ -69,18 +64,6 @@ class Photometry:
     def corner(self) -> float:
         """Transmission at the picture's corner relative to the principal point."""
         return float(np.exp(self.vignetting.sum()))
-
-
-def divided(captures: Captures, gains: Gains) -> Captures:
-    """The captures divided by their gains."""
-
-    def load(k: int) -> Loaded:
-        rgb, valid = captures.load(k)
-        rgb = (rgb / gains.factor(k, captures.cameras[k])).astype(np.float32)
-        rgb.setflags(write=False)
-        return rgb, valid
-
-    return Captures(captures.cameras, captures.lights, load)
 
 
 def corrected(captures: Captures, found: Photometry) -> Captures:

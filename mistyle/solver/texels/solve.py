@@ -161,17 +161,15 @@ def solution_after_rounds(
     The solver restarts with each estimate: indirect light can shift roughness and metallic into a local minimum, where
     they would stay otherwise.
     """
-    (solution, whole), problem, atlas = start, level.problem, level.context.atlas
-    direct = replace(whole, captures=level.context.captures)
-    context = replace(level.context, captures=direct.whole())
+    (solution, whole), context, problem, atlas = start, level.context, level.problem, level.context.atlas
     assert problem is not None
+    direct = replace(whole, captures=context.captures)
     if one.samples:
         table = scatter_to_atlas(solution.values, level.observed, atlas)
         sampling = one.samples, context.seed + one.begin
         for k, light, _ in journalled_light(context, level.renderer, table, sampling, journal, progress.part(0, 0.4)):
             direct = direct.with_indirect(k, light)
-    known = direct.indirect or direct.gains is not None
-    observed = observed_direct(level.observed, direct) if known else level.observed
+    observed = observed_direct(level.observed, direct) if direct.indirect else level.observed
     if one.samples:
         problem.reweight(observed.observations.weight)
         problem.retarget(observed.observations.rgb)
