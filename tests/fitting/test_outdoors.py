@@ -44,7 +44,8 @@ def observed(mesh, lights):
     renderer = MaterialRenderer(traced, blank, [(TEXELS, TEXELS)] * len(maps), RenderOptions(subsamples=4, memory=0))
     drawn = [renderer.image_and_coverage(pack(maps), k) for k in range(VIEWS)]
     captures = in_memory(cameras, [()] * VIEWS, [p for p, _ in drawn], [c > 0.999 for _, c in drawn])
-    texels, seen = unknown_light._observations(traced, captures, RecoverSettings())
+    noise = unknown_light.NOISE, unknown_light.RELATIVE
+    _, texels, seen = unknown_light._observations(traced, captures, RecoverSettings(), np.arange(VIEWS), noise)
     return traced, seen, np.concatenate([t.normal[t.covered] for t in texels])
 
 
