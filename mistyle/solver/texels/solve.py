@@ -91,10 +91,12 @@ def texel_level(
     )
     if start is not None:
         start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
-    note = (
-        f"The per-texel solver ran on a level {by} times coarser than the atlas (recover.solver_texels); finer detail "
-        "comes from the passes on whole pictures alone."
+    finer = (
+        "Finer albedo comes from the pictures over the fitted shading (recover.detail)."
+        if context.settings.detail
+        else "Finer detail comes from the passes on whole pictures alone."
     )
+    note = f"The per-texel solver ran on a level {by} times coarser than the atlas (recover.solver_texels). {finer}"
     context.notes.extend([note] * (note not in context.notes))
     # Its texels are larger than pixels, and samples under soft light are slow.
     return _level(coarse, coarse.renderer(1 if soft else None, left), by, start, progress)
