@@ -62,7 +62,7 @@ def solve(
         x = np.linalg.solve(normal, rhs)
         value = inverse * (sums - cross @ x)
         residual = y - value[point] - columns @ x
-        scale = 1.4826 * _weighted_median(np.abs(residual), weight)
+        scale = 1.4826 * max(weighted_median(np.abs(residual), weight), 1e-9)
         robust = weight * np.minimum(1, HUBER * scale / np.maximum(np.abs(residual), 1e-12))
     # A point's weighted residuals sum to 0, so its own value drops out of the sum over a cluster.
     slopes = (groups.T @ (sparse.diags_array(robust * residual) @ columns)).toarray()
@@ -70,7 +70,8 @@ def solve(
     return LinearFit(x, inverse_normal @ (slopes.T @ slopes) @ inverse_normal, value, residual, scale)
 
 
-def _weighted_median(values: Float[np.ndarray, " o"], weight: Float[np.ndarray, " o"]) -> float:
+def weighted_median(values: Float[np.ndarray, " o"], weight: Float[np.ndarray, " o"]) -> float:
+    """The smallest value up to which the values have half of the weight."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weight[order])
-    return max(float(values[order[np.searchsorted(total, 0.5 * total[-1])]]), 1e-9)
+    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])

@@ -14,7 +14,7 @@ step the texels are solved again at the new gains. Far from the solution the obs
 with the median residual, so that priors keep the texels plain and the gains explain the difference first.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,8 +29,9 @@ from mistyle.core.maps import Texels
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
 from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.solver.photometry.least_squares import one_hot
-from mistyle.solver.photometry.record import Gains, coordinates, fall_terms
+from mistyle.solver.photometry.least_squares import one_hot, weighted_median
+from mistyle.solver.photometry.record import Gains, fall_terms
+from mistyle.solver.photometry.solve import positions
 from mistyle.solver.prior import log_prior_penalty, metal_f0_prior, penalty
 from mistyle.solver.table import Atlas, linked
 from mistyle.solver.texels.gbuffer import open_sky, rig
@@ -93,47 +94,33 @@ class MaterialSamples:
 
 @dataclass(frozen=True)
 class MatchedMaterial:
-    """Gains, the texels, the robust cost, and the robust log difference between pictures and model; `covariance` of
-    gains (row by row) and vignetting."""
+    """Gains, the robust cost of their texels, and the robust log difference between pictures and model."""
 
     gains: Gains
-    values: Float[np.ndarray, "t 7"]
     cost: float
     spread: float
-    covariance: Float[np.ndarray, "m m"]
-
-
-def positions(observed: TexelObservations, cameras: Sequence[Camera]) -> Float[np.ndarray, "o 2"]:
-    """The observations' positions in their pictures, see `record.coordinates`."""
-    x = np.zeros((len(observed.observations.rgb), 2))
-    for camera, at in zip(cameras, observed.per_image, strict=True):
-        row, column = np.divmod(at.pixel, camera.size[1])
-        x[at.rows] = coordinates(camera, np.stack([column + at.x + 0.5, row + at.y + 0.5], axis=-1))
-    return x
 
 
 def material_samples(
     traced: Tracer,
     captures: Captures,
     tangents: Float[np.ndarray, "f 3 4"] | None,
-    facing: float = FACING,
-    progress: Callable[[float], None] = lambda done: None,
 ) -> MaterialSamples:
     """The observations of a coarse atlas in small pictures."""
     mesh = traced.mesh
     small = shrunk(captures, [-(-max(camera.size) // SIDE) for camera in captures.cameras])
-    options = ObservationOptions(facing, *NOISY, skies=False, move=0)
+    options = ObservationOptions(FACING, *NOISY, skies=False, move=0)
 
-    def observed_at(side: int, report: Callable[[float], None]) -> tuple[list[Texels], TexelObservations]:
+    def observed_at(side: int) -> tuple[list[Texels], TexelObservations]:
         texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
-        return texels, collect_observations(traced, texels, small, tangents, options, report)
+        return texels, collect_observations(traced, texels, small, tangents, options)
 
     side = max(LEAST_SIDE, int(ATLAS / len(mesh.parts) ** 0.5))
-    texels, observed = observed_at(side, lambda done: progress(0.5 * done))
+    texels, observed = observed_at(side)
     count, most = len(observed.observations.rgb), max(OBSERVATIONS, LEAST_EACH * len(captures))
     if count > most:
         side = max(LEAST_SIDE, int(side * (most / count) ** 0.5))
-        texels, observed = observed_at(side, lambda done: progress(0.5 + 0.5 * done))
+        texels, observed = observed_at(side)
     if has_soft(captures.lights):
         position, normal, _ = points_of(texels)
         sky = open_sky(traced, position, normal, even_directions(CELLS).astype(np.float32))
@@ -253,29 +240,21 @@ def solve_with_material(
             break
     work.scale = 1.0
     work.target(gains)
-    return _fit_of(work, gains, work.texels(work.anew(values)), full)
+    return _fit_of(work, gains, work.texels(work.anew(values)))
 
 
 def fixed_gains(samples: MaterialSamples, problem: Problem, gains: Gains) -> MatchedMaterial:
     """The texels at given gains."""
     work = _Solve(samples, problem)
     work.target(gains)
-    return _fit_of(work, gains, work.texels(work.anew()), True)
+    return _fit_of(work, gains, work.texels(work.anew()))
 
 
-def _fit_of(work: _Solve, gains: Gains, solution: Solution, full: bool) -> MatchedMaterial:
+def _fit_of(work: _Solve, gains: Gains, solution: Solution) -> MatchedMaterial:
     f, y = np.maximum(work.problem.predict(solution.values), LEAST), np.maximum(work.y, LEAST)
     weight = y**2 / (y**2 + DARK**2)
-    spread = 1.4826 * _weighted_median(np.abs(np.log(y / f)).ravel(), weight.ravel())
-    system = reduced_system(work.samples, work.problem, solution.values, work.y, work.weight)
-    covariance = np.linalg.inv(system.matrix * INDEPENDENT + gain_prior(len(gains.gain), full) * INDEPENDENT)
-    return MatchedMaterial(gains, solution.values, work.cost(solution), spread, covariance)
-
-
-def _weighted_median(values: np.ndarray, weight: np.ndarray) -> float:
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
+    spread = 1.4826 * weighted_median(np.abs(np.log(y / f)).ravel(), weight.ravel())
+    return MatchedMaterial(gains, work.cost(solution), spread)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 
 from mistyle.atlas.texels import rasterise
+from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, shrunk
 from mistyle.core.light import Ambient, Directional, Lights, Point
 from mistyle.render.mitsuba.draw import Tracer
@@ -138,10 +139,7 @@ def collect_points(
     texels = [rasterise(mesh, part, max(16, int(ATLAS / len(mesh.parts) ** 0.5))) for part in range(len(mesh.parts))]
     options = ObservationOptions(FACING, skies=False, move=0)
     observed = collect_observations(traced, texels, small, None, options, progress)
-    x = np.zeros((len(observed.observations.rgb), 2))
-    for camera, at in zip(small.cameras, observed.per_image, strict=True):
-        row, column = np.divmod(at.pixel, camera.size[1])
-        x[at.rows] = coordinates(camera, np.stack([column + at.x + 0.5, row + at.y + 0.5], axis=-1))
+    x = positions(observed, small.cameras)
     position, normal, _ = points_of(texels)
     away = np.stack([camera.position for camera in small.cameras])[observed.observations.picture]
     texel = np.repeat(np.arange(len(position)), observed.seen)
@@ -151,6 +149,15 @@ def collect_points(
     mirrored = 2 * cosine[:, None] * normal[texel] - away
     pieces = [_pieces(position, normal, side)[texel] for side in (PATCH, REGION)]
     return _chosen(observed, (x, 1 - cosine, away, mirrored, *pieces), _alike(lights), seed)
+
+
+def positions(observed: TexelObservations, cameras: Sequence[Camera]) -> Float[np.ndarray, "o 2"]:
+    """The observations' positions in their pictures, see `record.coordinates`."""
+    x = np.zeros((len(observed.observations.rgb), 2))
+    for camera, at in zip(cameras, observed.per_image, strict=True):
+        row, column = np.divmod(at.pixel, camera.size[1])
+        x[at.rows] = coordinates(camera, np.stack([column + at.x + 0.5, row + at.y + 0.5], axis=-1))
+    return x
 
 
 def _alike(lights: Sequence[Lights]) -> Int[np.ndarray, " n"]:
