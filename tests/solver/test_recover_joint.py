@@ -120,8 +120,7 @@ def test_a_pixel_is_the_mean_of_its_texels(drawn, rng):
         assert (pixels.lit > 0).all() and (pixels.lit <= 1).all()
     faced = np.concatenate([facing(problem.renderer, k) > 0.6 for k in range(len(pictures))])
     assert faced.mean() > 0.5
-    before = problem.images(table)
-    derivatives = joint._derivatives(problem, table, before)
+    before, derivatives = problem.images_and_slopes(table)
     noise = rng.standard_normal((64, 64, 6)).astype(np.float32)
     smooth = np.stack([gaussian(noise[..., c], 2.0) for c in range(6)], axis=-1)
     for change, most in ((np.full((4096, 6), 2e-4, np.float32), 0.04), (2e-3 * smooth.reshape(-1, 6), 0.1)):
@@ -150,10 +149,25 @@ def facing(renderer: MaterialRenderer, picture: int) -> np.ndarray:
     return np.concatenate(least)
 
 
-def test_jumps_are_no_slopes():
-    """Smooth changes are summed up; of one that jumps on one side the other is taken twice."""
-    ahead, back = np.array([1.0, 1.0, 9.0, -9.0, 0.1]), np.array([1.2, -1.0, 1.0, 1.0, 5.0])
-    np.testing.assert_allclose(joint._without_jumps(ahead, back), [2.2, 0, 2, 2, 0.2])
+@pytest.mark.parametrize(
+    ("columns", "far", "most"), [((0, 1, 2), 0.02, 1e-3), ((3,), 3e-4, 0.02), ((4,), 3e-4, 0.02), ((5,), 3e-4, 0.02)]
+)
+def test_slopes_are_those_of_differences(drawn, columns, far, most):
+    """Pictures are those without slopes; slopes equal central differences except where reflectance jumps between
+    them, where the two one-sided differences disagree."""
+    problem, table = drawn
+    images, slopes = problem.images_and_slopes(table)
+    moved = [table.copy(), table.copy()]
+    moved[0][:, columns] += far
+    moved[1][:, columns] -= far
+    before, (ahead, back) = problem.images(table), (problem.images(m) for m in moved)
+    number = {0: 0, 3: 1, 4: 2, 5: 3}[columns[0]]
+    for image, plain, slope, a, b in zip(images, before, slopes, ahead, back, strict=True):
+        np.testing.assert_allclose(image, plain, rtol=1e-5, atol=1e-6)
+        smooth = np.abs((a - plain) - (plain - b)) < 0.1 * np.abs(a - b) + 1e-6
+        assert smooth.mean() > 0.9
+        wrong = (slope[..., number] - (a - b) / (2 * far))[smooth]
+        assert np.linalg.norm(wrong) < most * np.linalg.norm((a - b)[smooth]) / (2 * far)
 
 
 def test_uncovered_texels_are_nearly_as_the_nearest_covered_one():

@@ -38,8 +38,8 @@ class BlockArrays:
     lights: tuple[Any, Any]
 
 
-def _fetch(textures: Any, samples: Samples) -> list[Any]:
-    """Interpolated albedo 3, normal 3, roughness, metallic of each sample."""
+def _fetch(textures: Any, samples: Samples, moved: tuple[Any, Any, Any] = (0, 0, 0)) -> list[Any]:
+    """Interpolated albedo 3, normal 3, roughness, metallic of each sample; `moved` is added to tilt and roughness."""
     import drjit as dr
     import mitsuba as mi
 
@@ -53,8 +53,8 @@ def _fetch(textures: Any, samples: Samples) -> list[Any]:
         for far_x, wx in ((0, 1 - x), (1, x)):
             index = corner + (right if far_x else 0) + (down if far_y else 0)
             row = dr.gather(_packets(), table, mi.UInt32(index), shape=(8, dr.width(index)))
-            x_y = row[TILT_X], row[TILT_Y]
-            values = [row[0], row[1], row[2], *x_y, _tilted_z(*x_y), row[ROUGHNESS], row[METALLIC]]
+            x_y = row[TILT_X] + moved[0], row[TILT_Y] + moved[1]
+            values = [row[0], row[1], row[2], *x_y, _tilted_z(*x_y), row[ROUGHNESS] + moved[2], row[METALLIC]]
             weight = wx * wy
             result = [dr.fma(weight, value, sum_) for value, sum_ in zip(values, result, strict=True)]
     return result
@@ -104,6 +104,26 @@ def image(terms, subsamples: int, textures, samples, pixels, lights) -> Any:
 
     rgb = _resolve(_colour(terms, _fetch(textures, samples), samples, lights), pixels, subsamples)
     return dr.ravel(mi.Vector4f(rgb.x, rgb.y, rgb.z, 0))
+
+
+def slopes(terms, subsamples: int, textures, samples, pixels, lights) -> tuple[Any, ...]:
+    """Packets (r, g, b, 0) of the lit pixels under delta lights, and of their derivatives by a change that all texels
+    share: of each channel by its own albedo, of all by both tilts and roughness. By forward mode: where reflectance is
+    discontinuous they are those of its branch."""
+    import drjit as dr
+    import mitsuba as mi
+
+    values = _fetch(textures, samples)
+    linear, constant = _delta_light(terms, values, samples, lights[0])
+    results = [mi.Color3f(*values[ALBEDO]) * linear + constant, linear]
+    for k in range(3):
+        moved = [mi.Float(0), mi.Float(0), mi.Float(0)]
+        dr.enable_grad(moved[k])
+        colour = _colour(terms, _fetch(textures, samples, tuple(moved)), samples, (lights[0], None))
+        dr.forward(moved[k])
+        results.append(dr.grad(colour))
+    means = (_resolve(colour, pixels, subsamples) for colour in results)
+    return tuple(dr.ravel(mi.Vector4f(c.x, c.y, c.z, 0)) for c in means)
 
 
 def _resolve(colour: Any, pixels: Pixels, subsamples: int) -> Any:

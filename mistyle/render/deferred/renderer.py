@@ -174,6 +174,21 @@ class MaterialRenderer:
             share[row : row + len(covered)] = covered / np.float32(self.subsamples)
         return rgb.reshape(*size, 3), share
 
+    def image_and_slopes(
+        self, table: Any, picture: int
+    ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3 4"]]:
+        """`image`, and the derivatives of its channels by their own albedo, both tilts and roughness if all texels
+        change alike. Delta lights only."""
+        size, textures = self.captures.cameras[picture].size, self._textures(table)
+        result = np.zeros((5, size[0] * size[1], 3), np.float32)
+        for block in self.blocks(picture, gradients=False):
+            run = self._function(block, "slopes", kernels.slopes, self._terms, self.subsamples)
+            lit = block.hits.counts[1]
+            for k, packets in enumerate(run(textures, block.hits.samples, block.hits.pixels, block.lights)):
+                result[k, block.pixel] = np.array(packets).reshape(-1, 4)[:lit, :3]
+        result = result.reshape(5, *size, 3)
+        return result[0], np.moveaxis(result[1:], 0, -1)
+
     def step(self, table: Any, pictures: Sequence[int], loss: Loss = "log_srgb_l1") -> tuple[Any, Any]:
         """(loss, gradient by the table) over some pictures, both Dr.Jit arrays that are not yet synchronised.
 

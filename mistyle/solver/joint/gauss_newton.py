@@ -6,9 +6,9 @@ that valley slowly. Gauss-Newton steps follow it at once. Around the current map
     I_p(x + d) = I_p(x) + D_p sum_t b_pt d_t
 
 Here b are the bilinear weights, averaged over the pixel's lit samples. D is the pixel's derivative by a change that all
-its texels share, from central differences of whole pictures. (D treats the samples of a pixel as equal. The pictures
-are exact, so the fixed point is exact up to that approximation.) R are the references. P are the priors of
-`solver/smoothing.py`, with variances estimated in the same way. Each step solves
+its texels share, by automatic differentiation (`render/deferred/kernels.slopes`). (D treats the samples of a pixel as
+equal. The pictures are exact, so the fixed point is exact up to that approximation.) R are the references. P are the
+priors of `solver/smoothing.py`, with variances estimated in the same way. Each step solves
 
     (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
 
@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
 from mistyle.core.stage_progress import StageProgress
-from mistyle.render.deferred.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, TILT_X, TILT_Y, MaterialTable
+from mistyle.render.deferred.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.joint.algebra import LinearisedImage, Unknowns, diagonal_blocks, normal_matvec, pcg, rhs
 from mistyle.solver.joint.pixels import (
@@ -54,13 +54,9 @@ from mistyle.solver.texels.solve import estimate_indirect
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
-# Finite differences: columns of the table that move together, and the step to either side. A channel of a picture
-# depends on its own channel of the albedo only.
-MOVES = (((0, 1, 2), 0.02), ((TILT_X,), 0.003), ((TILT_Y,), 0.003), ((ROUGHNESS,), 0.01))
 # Scale of the residuals' standard deviation relative to `noise` and `relative`: LOOSE times the median's estimate,
 # since there are about as many unknowns as pixels and most pixels overfit; FIT at least.
 LOOSE, FIT = 1.4, 0.1
-JUMP = 3.0  # ratio of the two one-sided differences above which the function counts as discontinuous
 CAUCHY_SCALE = 1.4  # scale of the Cauchy loss, in standard deviations
 EDGE = 0.1  # standard deviation of partly lit pixels, relative to the radiance of their lit samples
 BETWEEN = 0.15  # relative standard deviation of indirect light
@@ -102,6 +98,17 @@ class JointProblem:
         """The footprints' pixels of all rendered pictures."""
         uploaded = self.renderer.upload(table)
         return [self.renderer.image(uploaded, k).reshape(-1, 3)[p.index] for k, p in enumerate(self.footprints)]
+
+    def images_and_slopes(
+        self, table: MaterialTable
+    ) -> tuple[list[Float[np.ndarray, "_ 3"]], list[Float[np.ndarray, "_ 3 4"]]]:
+        """`images`, and their derivatives by a change that a pixel's texels share (`LinearisedImage`)."""
+        uploaded, images, slopes = self.renderer.upload(table), [], []
+        for k, pixels in enumerate(self.footprints):
+            image, slope = self.renderer.image_and_slopes(uploaded, k)
+            images.append(image.reshape(-1, 3)[pixels.index])
+            slopes.append(slope.reshape(-1, 3, 4)[pixels.index])
+        return images, slopes
 
     def references(self) -> list[Float[np.ndarray, "_ 3"]]:
         """The footprints' pixels of the references, without indirect light."""
@@ -177,8 +184,8 @@ def _steps(
     for k in range(settings.joint):
 
         def step(x=x, k=k) -> dict[str, np.ndarray]:
-            images = problem.images(x)
-            linearised = _linearised(problem, x, images, (_residuals(problem, references, images, x - table), errors))
+            images, slopes = problem.images_and_slopes(x)
+            linearised = _linearised(problem, slopes, _residuals(problem, references, images, x - table), errors)
             progress((k + 0.5) / settings.joint)
             change = _step(x, linearised, unknown, problem.context.atlas)
             new = _updated(x, unknown, change, settings.roughness_floor)
@@ -212,17 +219,17 @@ def _residuals(
 
 def _linearised(
     problem: JointProblem,
-    table: MaterialTable,
-    images: Sequence[np.ndarray],
-    errors: tuple[Sequence[np.ndarray], Sequence[ResidualStd]],
+    slopes: Sequence[np.ndarray],
+    residuals: Sequence[np.ndarray],
+    errors: Sequence[ResidualStd],
 ) -> list[LinearisedImage]:
-    """The pictures linearised at `table`; `errors` are residuals and their standard deviations."""
-    derivatives = _derivatives(problem, table, images)
-    for derivative, more in zip(derivatives, problem.reflected, strict=True):
-        derivative[:, :, :3] += more
+    """The pictures linearised where their `slopes` were computed; the derivatives of indirect light are added to
+    these, in place."""
+    for slope, more in zip(slopes, problem.reflected, strict=True):
+        slope[:, :, :3] += more
     return [
         LinearisedImage(p.fetch, d, _weights(r, d, e), np.nan_to_num(r))
-        for p, d, r, e in zip(problem.footprints, derivatives, *errors, strict=True)
+        for p, d, r, e in zip(problem.footprints, slopes, residuals, errors, strict=True)
     ]
 
 
@@ -290,35 +297,6 @@ def _weights(residuals: np.ndarray, derivative: np.ndarray, errors: ResidualStd)
     sound = np.isfinite(weight) & np.isfinite(derivative).all(axis=2)
     derivative[~sound] = 0
     return np.where(sound, weight, 0).astype(np.float32)
-
-
-def _derivatives(
-    problem: JointProblem, table: MaterialTable, images: Sequence[Float[np.ndarray, "_ 3"]]
-) -> list[Float[np.ndarray, "_ 3 4"]]:
-    """Finite differences of `images`, the renders of `table`, by MOVES."""
-    pictures, floor = problem.footprints, problem.context.settings.roughness_floor
-    result = [np.zeros((len(p.index), 3, len(MOVES)), np.float32) for p in pictures]
-    for j, (columns, far) in enumerate(MOVES):
-        up, down = table.copy(), table.copy()
-        up[:, columns] += far
-        down[:, columns] -= far
-        if columns == (ROUGHNESS,):  # one-sided at the bounds of roughness
-            up[:, ROUGHNESS] = np.minimum(up[:, ROUGHNESS], 1)
-            down[:, ROUGHNESS] = np.maximum(down[:, ROUGHNESS], floor)
-        high, low = problem.images(up), problem.images(down)
-        moved = (up - down)[problem.unknown.rows, columns[0]]
-        for each, p, image, a, b in zip(result, pictures, images, high, low, strict=True):
-            change = _without_jumps(a - image, image - b) if columns in ((TILT_X,), (TILT_Y,)) else a - b
-            each[:, :, j] = change / np.maximum(p.fetch @ moved, far / 10)[:, None]
-    return result
-
-
-def _without_jumps(ahead: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Their sum, or twice the smaller where they differ by more than JUMP: reflectance is discontinuous where the
-    mapped normal turns away from the camera or the light."""
-    first = np.abs(ahead) < np.abs(back)
-    smaller, larger = np.where(first, ahead, back), np.where(first, back, ahead)
-    return np.where(np.abs(larger) > JUMP * np.abs(smaller), 2 * smaller, ahead + back)
 
 
 def _step(table: MaterialTable, images: Sequence[LinearisedImage], unknown: UnknownTexels, atlas: Atlas) -> Unknowns:
