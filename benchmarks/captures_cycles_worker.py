@@ -136,7 +136,7 @@ def sky(scene, job):
 
 def materials(job):
     for material in bpy.data.materials:
-        material.use_bump_map_correction = "bump" not in job["plain"]
+        material.cycles.use_bump_map_correction = "bump" not in job["plain"]
         for node in material.node_tree.nodes if material.node_tree else []:
             if node.type == "BSDF_PRINCIPLED":
                 unlink(material.node_tree, node, "Emission Strength", 0.0)
