@@ -10,8 +10,9 @@ a side), samples, seed, threads, hdri and strength (of the world), plus `plain`,
 
 Writes the pictures, and `transforms.json` and `lights.json` with Blender's own numbers: its cameras' matrices, its
 world (Z up), its units. Everything that is not named here has Blender's factory settings. Emission is off: a fit has
-none. `plain` may hold "box" (pixel filter), "ggx" (no light between facets), "bump" (no correction of the shadow
-terminator), "clamp" (indirect light unclamped), "denoise" (denoised). Does not import mistyle.
+none. `plain` may hold "box" (pixel filter), "ggx" (no light between facets), "bump" and "facets" (no correction
+of shadows at relief and at low-poly facets), "clamp" (indirect light unclamped), "denoise" (denoised). Does not import
+mistyle.
 """
 
 import json
@@ -40,6 +41,8 @@ def main(path):
             bpy.data.objects.remove(thing)
     bpy.context.view_layer.update()
     centre, radius = sphere(scene)
+    for thing in scene.objects if "facets" in job["plain"] else ():
+        thing.shadow_terminator_geometry_offset = 0.0
     materials(job)
     settings(scene, job)
     camera = new(scene, "camera", bpy.data.cameras.new("camera"))
