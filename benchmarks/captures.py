@@ -22,7 +22,8 @@ trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out
 `benchmarks.material_recovery --maps own_soft` draws and fits them; of both the worse: `metals.metallic_right` (share of
 the surface that three cameras see), `metals.albedo_psnr` and `calibration.worst` (from 0.683, over all maps).
 
-`--only plan`: plan against time of five jobs (`captures_plan.py`).
+`--only plan`: plan against time of five jobs (`captures_plan.py`). `--only cycles`: pictures that Blender drew
+(`captures_cycles.py`).
 
 --quick fits textures of 256², texel by texel alone; the phone's pictures have 160 pixels a side,
 the metals' 96.
@@ -42,6 +43,7 @@ from jaxtyping import Float
 
 from benchmarks import material_recovery as recovery
 from benchmarks import recovery_pictures as drawing
+from benchmarks.captures_cycles import cycles
 from benchmarks.captures_plan import plans, watched
 from benchmarks.common import finish, parser, run_mistyle
 from benchmarks.material_metrics import align_channels, map_errors, orb_mask, psnr_ldr
@@ -87,7 +89,7 @@ class CastleRun:
 
 def main() -> None:
     options = parser(__doc__ or "")
-    parts = ("castle", "phone", "metals", "plan")
+    parts = ("castle", "phone", "metals", "plan", "cycles")
     options.add_argument("--only", choices=parts, action="append", help="only this part (repeatable)")
     options.add_argument("--keep", type=Path, help="folder for the runs, to look at afterwards")
     chosen = options.parse_args()
@@ -102,6 +104,8 @@ def main() -> None:
             figures |= metals(place / "metals", chosen.quick)
         if "plan" in (chosen.only or []):
             figures |= plans(place / "plan", chosen.quick)
+        if "cycles" in (chosen.only or []):
+            figures |= cycles(place / "cycles", chosen.quick)
     finish(figures, chosen.json)
 
 

@@ -24,6 +24,8 @@ from mistyle.core.light import (
     environment_radiance,
 )
 
+Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
+
 
 def similarity(
     scale: float, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]
@@ -61,13 +63,15 @@ def moved_lights(rig: Lights, matrix: Float[np.ndarray, "4 4"]) -> Lights:
     return tuple(_moved(light, matrix) for light in rig)
 
 
-def moved(captures: Captures, work_from_cams: Float[np.ndarray, "4 4"]) -> Captures:
-    """References with cameras and lights in another space; the pictures do not change."""
+def moved(captures: Captures, work_from_cams: Float[np.ndarray, "4 4"], environments: bool = True) -> Captures:
+    """References with cameras and lights in another space; the pictures do not change, nor do `environments` if so
+    wished."""
+    kept = () if environments else (Environment,)
     rig_cache: dict[int, Lights] = {}
     rigs = []
     for rig in captures.lights:
         if id(rig) not in rig_cache:
-            rig_cache[id(rig)] = moved_lights(rig, work_from_cams)
+            rig_cache[id(rig)] = tuple(x if isinstance(x, kept) else _moved(x, work_from_cams) for x in rig)
         rigs.append(rig_cache[id(rig)])
     cameras = tuple(moved_camera(camera, work_from_cams) for camera in captures.cameras)
     return Captures(cameras, tuple(rigs), captures.load)
@@ -101,6 +105,12 @@ def turned(light: Environment, rotation: Float[np.ndarray, "3 3"]) -> Environmen
 def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
     x, y, z = np.asarray(values, float).tolist()
     return (x, y, z)
+
+
+def upright(captures: Captures) -> Captures:
+    """References of a world with Z up, in one with Y up. The first row of an environment is up in both, so its map
+    stays as it is: the middle looks along -Y of the world with Z up, the columns to the right of it towards -X."""
+    return moved(captures, similarity(1.0, Y_FROM_Z, np.zeros(3)), environments=False)
 
 
 def fit_similarity(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:

@@ -25,7 +25,17 @@ from mistyle.core.light import (
 )
 from mistyle.core.mesh import Mesh
 from mistyle.geometry.icp import align_points, in_masks, visual_hull
-from mistyle.geometry.similarity import fit_similarity, moved, moved_camera, moved_lights, scale_of, similarity, turned
+from mistyle.geometry.similarity import (
+    Y_FROM_Z,
+    fit_similarity,
+    moved,
+    moved_camera,
+    moved_lights,
+    scale_of,
+    similarity,
+    turned,
+    upright,
+)
 from mistyle.io.cameras.camera_files import transforms
 from mistyle.io.cameras.captures import read_captures
 from mistyle.io.images.write import write_png
@@ -166,6 +176,28 @@ def test_moved_references_share_their_moved_lights(cameras):
     pictures = [np.ones((192, 192, 3), np.float32)] * 3
     after = moved(in_memory(cameras[:3], [rig, rig, (Ambient((1.0, 1.0, 1.0)),)], pictures), TRUE)
     assert after.lights[0] is after.lights[1] and after.load(2)[0] is pictures[2]
+
+
+def test_a_world_with_z_up_is_stood_up(cameras, rng):
+    """What Blender says of its world: the point over the origin, a light from there, and a picture all around."""
+    sky = Environment(rng.random((32, 64, 3)).astype(np.float32), turn=90)
+    rig = (Directional((0.0, 0.0, 1.0), (1.0, 1.0, 1.0)), Point((1.0, 2.0, 3.0), (4.0, 4.0, 4.0)), sky)
+    before = in_memory(cameras[:2], [rig, rig], [np.ones((192, 192, 3), np.float32)] * 2)
+    after = upright(before)
+    sun, lamp, same = after.lights[0]
+    assert after.lights[0] is after.lights[1] and same is sky
+    assert sun.direction == pytest.approx((0, 1, 0)) and lamp.position == pytest.approx((1, 3, -2))
+    assert lamp.intensity == pytest.approx((4, 4, 4))
+    there = (px_from_world(c, np.array([[0.1, -0.2, 0.3]]))[0] for c in before.cameras)
+    here = (px_from_world(c, np.array([[0.1, 0.3, 0.2]]))[0] for c in after.cameras)
+    assert np.array(list(there)) == pytest.approx(np.array(list(here)))
+    # Cycles: u = 0.5 - atan2(y, x) / 2 pi, v = 0.5 + asin(z) / pi, of its own axes.
+    towards = np.array([[0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])  # u = 0.5 and 0.75
+    seen = environment_radiance(sky, towards @ Y_FROM_Z.T)
+    row = np.degrees(np.arccos(0.8)) / 180 * 31
+    for value, column in zip(seen, (32, 48), strict=True):
+        ends = sky.radiance[[int(row), int(row) + 1], column - 1 : column + 1].mean(axis=1)
+        assert value == pytest.approx(ends[0] * (1 - row % 1) + ends[1] * (row % 1), rel=1e-4)
 
 
 def test_points_are_laid_on_the_mesh(mesh, rng):

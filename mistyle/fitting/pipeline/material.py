@@ -205,12 +205,13 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
 def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Placed:
     """The cameras in working space: unchanged, converted from the mesh's units, or aligned and refined on request; and
     the overlap of the mesh's outlines with the masks."""
-    from mistyle.geometry.similarity import moved
+    from mistyle.geometry.similarity import moved, upright
     from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
     from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
     from mistyle.solver.cameras.outline_check import check_outlines, overlap_notes
 
     chosen = job.settings.references
+    captures = upright(captures) if chosen.up == "z" else captures
     figures: dict[str, float] = {}
     notes: list[str] = []
     masks, sparse = None, sparse_points(job.references) if chosen.align else None
@@ -244,7 +245,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     overlaps = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
     ours = camera_space(job.references) == "working" and not chosen.align
     names = [camera.name for camera in captures.cameras]
-    warnings = overlap_notes(names, overlaps, chosen.overlap, camera_advice(chosen), trusted=ours)
+    warnings = overlap_notes(names, overlaps, chosen.overlap, camera_advice(chosen, overlaps), trusted=ours)
     if np.isfinite(overlaps.overlap).any():
         mean, least = float(np.nanmean(overlaps.overlap)), float(np.nanmin(overlaps.overlap))
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}

@@ -18,6 +18,11 @@ class ReferenceSettings(BaseModel):
     saturation: float = Field(
         default=1.0, gt=0, le=1, description="least encoded value of a saturated channel (below 1 for JPEGs)"
     )
+    up: Literal["y", "z"] = Field(
+        default="y",
+        description="axis that points up in the world of cameras and lights; z: Blender's cameras beside a mesh with Y "
+        "up, such as its glTF; environments stand upright in both",
+    )
     align: bool = Field(default=False, description="find the similarity that brings the mesh into the cameras' space")
     refine_poses: bool = Field(default=False, description="improve every camera against the mesh before fitting")
     overlap: float = Field(

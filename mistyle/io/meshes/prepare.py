@@ -15,6 +15,7 @@ from mistyle.core.names import distinct
 from mistyle.geometry.normals import area_vectors, crease_normals, same_points, usable_normals
 from mistyle.geometry.raster import fragments
 from mistyle.geometry.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
+from mistyle.geometry.similarity import Y_FROM_Z
 from mistyle.geometry.unwrap import unwrap
 from mistyle.geometry.upright import lies_on_its_side
 from mistyle.geometry.uvs import Layout, Verdict, arrange, signed_areas
@@ -30,7 +31,6 @@ TORN = "faces that share texels have different vertex colours"
 MAX_TORN = 0.05  # largest difference (linear) of two faces' vertex colours in one texel
 PALETTE = 4  # mean texels a face, below which a texture is a palette
 FACE_TEXELS = 64  # of a palette's face after resampling
-Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
 SIDEWAYS = (
     "The mesh seems to lie on its side: it is tallest along z, with its base at the lower end. --up z turns it upright."
 )

@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.asset import TURNED
+from mistyle.geometry.similarity import Y_FROM_Z
 from mistyle.io.sandbox.bounds import MAX_NODES, refuse
 from mistyle.io.usd.layers import check_layers, usd_message
 from mistyle.io.usd.shapes import is_shape
-
-Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def open_stage(pxr: Any, path: Path) -> Any:

@@ -23,7 +23,8 @@ SIDE = 160  # pixels of the longer side: resolves some 1 % of the overlap
 FEW = 6  # pictures that are also compared under rotated cameras
 ALIKE = 0.02  # insignificant difference of mean overlaps
 # Frames that conventions confuse, as rotations of the cameras about X, degrees.
-TURNS = {"by 90 degrees about X": 90.0, "by -90 degrees about X": -90.0, "by 180 degrees about X": 180.0}
+Z_UP = "by -90 degrees about X"  # turns cameras of a world with Z up
+TURNS = {"by 90 degrees about X": 90.0, Z_UP: -90.0, "by 180 degrees about X": 180.0}
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,8 @@ from mistyle.core.camera import Camera, orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.mesh import Mesh
+from mistyle.fitting.pipeline.outlines import camera_advice
+from mistyle.fitting.settings.material import ReferenceSettings
 from mistyle.io.cameras.camera_files import camera_entry, read_cameras, read_frames, transforms
 from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots, reading_notes
 from mistyle.io.cameras.colmap import read_model
@@ -510,6 +512,11 @@ def test_outlines_tell_right_frames_from_wrong_ones():
         (note,) = overlap_notes(names, found, 0.8, "Try --align")
         assert note.startswith("Warning: the cameras do not fit the mesh") and "Try --align" in note, name
         assert (hint or "") in note and (hint is not None) == ("With the cameras turned" in note), name
+    blender = moved(TURN.T)
+    chosen = ReferenceSettings()
+    assert "--set references.up=z" in camera_advice(chosen, blender)
+    for settings, found in ((chosen.model_copy(update={"up": "z"}), blender), (chosen, moved(TURN)), (chosen, right)):
+        assert "--align" in camera_advice(settings, found)
 
 
 def test_outlines_that_do_not_show_a_turn_are_said():
