@@ -21,11 +21,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
-from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, shrunk
+from mistyle.core.capture import Captures, shrunk_to
 from mistyle.core.light import has_soft
-from mistyle.core.maps import Texels
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
 from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
@@ -39,14 +37,14 @@ from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Poi
 from mistyle.solver.texels.observations import (
     ObservationOptions,
     TexelObservations,
-    collect_observations,
+    coarse_observations,
     observation_std,
     points_of,
 )
 from mistyle.solver.texels.rounds import CLASSES, STARTS, best, best_by_region
 
 SIDE = 256  # pixels along the longer side of the small pictures
-ATLAS, LEAST_SIDE = 128, 16  # texels a side of the coarse atlas, all sets together, and of each set at least
+ATLAS = 128  # texels a side of the coarse atlas, all sets together
 LEAST_EACH = 300  # observations of a picture, at least on average
 CELLS = 256  # of soft light: highlights of metals must not depend on where a cell is
 OBSERVATIONS = 20_000  # at most, about
@@ -108,19 +106,10 @@ def material_samples(
 ) -> MaterialSamples:
     """The observations of a coarse atlas in small pictures."""
     mesh = traced.mesh
-    small = shrunk(captures, [-(-max(camera.size) // SIDE) for camera in captures.cameras])
+    small = shrunk_to(captures, SIDE)
     options = ObservationOptions(FACING, *NOISY, skies=False, move=0)
-
-    def observed_at(side: int) -> tuple[list[Texels], TexelObservations]:
-        texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
-        return texels, collect_observations(traced, texels, small, tangents, options)
-
-    side = max(LEAST_SIDE, int(ATLAS / len(mesh.parts) ** 0.5))
-    texels, observed = observed_at(side)
-    count, most = len(observed.observations.rgb), max(OBSERVATIONS, LEAST_EACH * len(captures))
-    if count > most:
-        side = max(LEAST_SIDE, int(side * (most / count) ** 0.5))
-        texels, observed = observed_at(side)
+    most = max(OBSERVATIONS, LEAST_EACH * len(captures))
+    texels, observed = coarse_observations(traced, small, tangents, options, ATLAS, most)
     if has_soft(captures.lights):
         position, normal, _ = points_of(texels)
         sky = open_sky(traced, position, normal, even_directions(CELLS).astype(np.float32))
