@@ -12,8 +12,8 @@ Pictures are 8-bit JPEGs with exposures of ±1 EV, white balances of ±10 % and 
 `--only bounds`: the same figures as `bounds.clean.*` (clean pictures, unknown sky, no photometry) and
 `bounds.known.*` (the phone's pictures, known sky).
 
-`--only known`: 16 views x three delta lights, one at a time. They stand still around Suzanne, and are fixed to the
-camera for Avocado.
+`--only known`: 16 views and three delta lights, one at a time. They stand still around Suzanne, with 26 pictures of
+lit sides, and are fixed to the camera for Avocado, with 48 pictures.
 
     known.exposure_error    largest error of a gain, relative
     known.maps_ratio        largest ratio of an error to that from clean pictures without photometry: mean angle of the
@@ -104,10 +104,15 @@ def known(place: Path, quick: bool) -> dict[str, float]:
 
 
 def standing(cameras: Sequence[Camera]) -> list[Shot]:
-    """Every camera under each of the lights of STANDING."""
+    """Every camera under those of the lights of STANDING that do not shine from behind the object."""
     units = [(np.array(d) / np.linalg.norm(d)).tolist() for d in STANDING]
     lights = [Directional((x, y, z), (2.5, 2.5, 2.5)) for x, y, z in units]
-    return [Shot(replace(c, name=f"{c.name}_light{k}"), (light,)) for c in cameras for k, light in enumerate(lights)]
+    return [
+        Shot(replace(camera, name=f"{camera.name}_light{k}"), (light,))
+        for camera in cameras
+        for k, light in enumerate(lights)
+        if camera.position @ np.array(light.direction) > 0
+    ]
 
 
 def _under_sky(name: str, place: Path, quick: bool, words: Sequence[Any], *, clean: bool = False) -> dict[str, float]:

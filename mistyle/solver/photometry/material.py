@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from mistyle.core.camera import Camera
@@ -46,6 +46,7 @@ from mistyle.solver.texels.rounds import CLASSES, STARTS, best, best_by_region
 SIDE = 256  # pixels along the longer side of the small pictures
 ATLAS = 128  # texels a side of the coarse atlas, all sets together
 LEAST_EACH = 300  # observations of a picture, at least on average
+SHOWN = 12  # observations from which on a picture has an exposure of its own, and a spread
 CELLS = 256  # of soft light: highlights of metals must not depend on where a cell is
 OBSERVATIONS = 20_000  # at most, about
 MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.6, 0.0)  # prior of a texel: a sample of a bumpy surface, hardly tilted
@@ -64,7 +65,7 @@ LONGEST = 1.0  # largest change of a log gain in a step
 # Standard deviations of exposures, balances and vignetting around 0, and of those not solved for; INDEPENDENT is the
 # share of independent observations.
 EXPOSURE, BALANCE, FALL, FIXED = 1.0, 0.2, 0.5, 1e-4
-INDEPENDENT = 0.02
+INDEPENDENT = 0.1
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,11 @@ class MaterialSamples:
         return len(self.rig.eye)
 
     @property
+    def shown(self) -> Int[np.ndarray, " n"]:
+        """Number of observations of each picture."""
+        return np.bincount(self.observations.picture, minlength=self.pictures)
+
+    @property
     def owner(self) -> Int[np.ndarray, " o"]:
         """Each observation's texel."""
         return np.repeat(np.arange(len(self.points.position)), np.diff(self.observations.start))
@@ -92,11 +98,13 @@ class MaterialSamples:
 
 @dataclass(frozen=True)
 class MatchedMaterial:
-    """Gains, the robust cost of their texels, and the robust log difference between pictures and model."""
+    """Gains, the robust cost of their texels, and the robust log difference between pictures and model: of all, and of
+    each picture, 0 for those with fewer than SHOWN observations."""
 
     gains: Gains
     cost: float
     spread: float
+    spreads: Float[np.ndarray, " n"]
 
 
 def material_samples(
@@ -211,8 +219,10 @@ def solve_with_material(
     *,
     full: bool = True,
 ) -> MatchedMaterial:
-    """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures."""
-    work, gains = _Solve(samples, problem), start
+    """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures. A picture with
+    fewer than SHOWN observations keeps the mean exposure."""
+    work, shown = _Solve(samples, problem), samples.shown >= SHOWN
+    gains = Gains(np.where(shown[:, None], start.gain - start.gain[shown].mean(axis=0), 0), start.vignetting)
     work.scale = FIRST_SCALE
     work.target(gains)
     values = work.anew()
@@ -221,7 +231,7 @@ def solve_with_material(
         work.target(gains)
         values = work.texels(values).values if k % RESTARTS else work.anew(values)
         system = reduced_system(samples, problem, values, work.y, work.weight)
-        change = np.clip(_step(system, gains, full), -LONGEST, LONGEST)
+        change = np.clip(_step(system, gains, full, shown), -LONGEST, LONGEST)
         gains = gains.moved(change)
         work.target(gains)
         values = work.texels(values).values
@@ -241,9 +251,11 @@ def fixed_gains(samples: MaterialSamples, problem: Problem, gains: Gains) -> Mat
 
 def _fit_of(work: _Solve, gains: Gains, solution: Solution) -> MatchedMaterial:
     f, y = np.maximum(work.problem.predict(solution.values), LEAST), np.maximum(work.y, LEAST)
-    weight = y**2 / (y**2 + DARK**2)
-    spread = 1.4826 * weighted_median(np.abs(np.log(y / f)).ravel(), weight.ravel())
-    return MatchedMaterial(gains, work.cost(solution), spread)
+    weight, apart = y**2 / (y**2 + DARK**2), 1.4826 * np.abs(np.log(y / f))
+    spreads, picture = np.zeros(len(gains.gain)), work.samples.observations.picture
+    for k in np.flatnonzero(work.samples.shown >= SHOWN):
+        spreads[k] = weighted_median(apart[picture == k].ravel(), weight[picture == k].ravel())
+    return MatchedMaterial(gains, work.cost(solution), weighted_median(apart.ravel(), weight.ravel()), spreads)
 
 
 @dataclass(frozen=True)
@@ -341,10 +353,11 @@ def gain_prior(n: int, full: bool) -> Float[np.ndarray, "m m"]:
     return matrix / INDEPENDENT
 
 
-def _step(system: ReducedSystem, gains: Gains, full: bool) -> Float[np.ndarray, " m"]:
-    """The change of gains and vignetting; the gains of each channel keep their mean at 0."""
+def _step(system: ReducedSystem, gains: Gains, full: bool, shown: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """The change of gains and vignetting; the gains of each channel keep their mean at 0, those of pictures that are
+    not `shown` keep theirs."""
     n, x = len(gains.gain), np.concatenate([gains.gain.ravel(), gains.vignetting])
     held = gain_prior(n, full)
     level = float(np.trace(system.matrix)) / len(x)
-    held[: 3 * n, : 3 * n] += level * np.kron(np.ones((n, n)), np.eye(3))
+    held[: 3 * n, : 3 * n] += level * np.kron(np.outer(shown, shown) + n * np.diag(~shown), np.eye(3))
     return np.linalg.solve(system.matrix + held, system.gradient - held @ x)

@@ -132,9 +132,10 @@ def _share(samples: PointSamples, captures: Captures) -> Float[np.ndarray, "o 2"
 def collect_points(
     traced: Tracer, captures: Captures, seed: int = 0, progress: Callable[[float], None] = lambda done: None
 ) -> PointSamples:
-    """Observations of the mesh's points in small pictures; silhouettes and saturated pixels are left out."""
+    """Observations of the mesh's points in small pictures; silhouettes, saturated pixels and shadows of known lights
+    are left out."""
     mesh, lights = traced.mesh, captures.lights
-    small = shrunk_to(evenly_lit(captures), SIDE)
+    small = shrunk_to(captures if all(lights) else evenly_lit(captures), SIDE)
     texels = [rasterise(mesh, part, max(16, int(ATLAS / len(mesh.parts) ** 0.5))) for part in range(len(mesh.parts))]
     options = ObservationOptions(FACING, skies=False, move=0)
     observed = collect_observations(traced, texels, small, None, options, progress)
