@@ -13,6 +13,7 @@ from test_passes import hashes
 import mistyle
 from benchmarks.captures_phone import Drawn, gains, photograph
 from benchmarks.recovery_pictures import Shot
+from mistyle.cli.main import main
 from mistyle.fitting.pipeline.job import MaterialJob
 from mistyle.fitting.pipeline.photometry import photometry_mode
 from mistyle.fitting.settings.material import MaterialSettings, PhotometrySettings
@@ -39,15 +40,12 @@ def drawn(tmp_path_factory):
     return Drawn(folder / "bowl.obj", None, shots, pictures)
 
 
-def fitted(drawn: Drawn, place: Path, done: Gains, **more):
-    if not (place / "shots").exists():
-        photograph(place / "shots", drawn, done)
-    return mistyle.fit(drawn.file, place / "shots", place / "out", masks=place / "shots" / "masks", **(QUICK | more))
-
-
 def test_exposures_under_known_light_are_solved_and_said(drawn, tmp_path, capsys):
     done = gains(len(drawn.shots), 1)
-    fitted(drawn, tmp_path, done)
+    photograph(tmp_path / "shots", drawn, done)
+    words = ["--atlas", SIZE, "--set", "recover.solver=texels", "--set", "recover.bounces=0", "--report", "none"]
+    shots = [tmp_path / "shots", "--masks", tmp_path / "shots" / "masks", "-o", tmp_path / "out"]
+    assert main([str(word) for word in ("fit", drawn.file, *shots, *words)]) == 0
     assert "--photometry none" in capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "run.json").read_text())["photometry"]
     assert found["applied"]
@@ -58,11 +56,14 @@ def test_exposures_under_known_light_are_solved_and_said(drawn, tmp_path, capsys
 
 def test_pictures_that_agree_give_the_bytes_of_a_fit_without_photometry(drawn, tmp_path):
     nothing = Gains(np.zeros((len(drawn.shots), 3)), np.zeros(3))
-    summary = fitted(drawn, tmp_path, nothing)
-    assert any("nothing was corrected" in note for note in summary["notes"])
-    solved = hashes(tmp_path / "out")
-    fitted(drawn, tmp_path, nothing, photometry={"mode": "none"})
-    assert hashes(tmp_path / "out") == solved
+    photograph(tmp_path / "shots", drawn, nothing)
+    fits = []
+    for mode in ("auto", "none"):
+        words = {"masks": tmp_path / "shots" / "masks", "photometry": {"mode": mode}}
+        summary = mistyle.fit(drawn.file, tmp_path / "shots", tmp_path / mode, **words, **QUICK)
+        fits.append((summary["notes"], hashes(tmp_path / mode)))
+    assert any("nothing was corrected" in note for note in fits[0][0])
+    assert fits[0][1] == fits[1][1]
 
 
 @pytest.mark.parametrize("lights", ["unknown", None])
