@@ -23,9 +23,6 @@ from mistyle.solver.photometry.record import Gains, Photometry, gains_of, with_g
 from mistyle.solver.photometry.solve import AGREE, LOWER
 from mistyle.solver.texels.levenberg_marquardt import Options
 
-# Log difference by which gains must lower that of a picture. They lower it by up to 0.0014 in pictures that agree, by
-# 0.012 to 0.23 in one whose exposure differs by 0.2.
-LOWERED = 0.01
 EXPLAINED = 0.05  # difference up to which a material without a veil shows that the veil was gloss
 
 
@@ -47,9 +44,9 @@ def explained(
     """The photometry that a material explains best, and whether it was solved with the material.
 
     `captures` are those as photographed, under known light; `start` are gains to begin at. Metallic is free whatever is
-    fitted later. Nothing is corrected where the gains make no picture's difference from the model smaller, by LOWERED
-    and to LOWER of that as photographed: errors of the model (indirect light) pass for gains of some percent. A veil of
-    `found` stays unless a material explains the pictures without.
+    fitted later. Nothing is corrected where the gains make no picture's difference from the model smaller, by AGREE
+    and to LOWER of that as photographed: errors of the model (indirect light) pass for gains of some percent and lower
+    it by up to 0.008. A veil of `found` stays unless a material explains the pictures without.
     """
     samples = material_samples(traced, captures, tangents)
     problem, n = problem_of(samples, replace(options, metallic=True)), len(captures)
@@ -64,7 +61,7 @@ def explained(
         return found, False
     chosen = fit if veiled else min((fit, points), key=lambda each: each.spread)
     bare = without_gains(found)
-    better = (chosen.spreads < LOWER * plain.spreads) & (chosen.spreads < plain.spreads - LOWERED)
+    better = (chosen.spreads < LOWER * plain.spreads) & (chosen.spreads < plain.spreads - AGREE)
     if not better.any() or _small(chosen.gains):
         note = "Photometry: different exposures do not explain the pictures better; nothing was corrected."
         return replace(bare, spread=(plain.spread, plain.spread), notes=(note,)), False
