@@ -14,9 +14,7 @@ trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out
                                         direction, over that of equally distant texels elsewhere
     castle.shadow_pairs                 the number of pairs across such borders
 
-`phone`: two assets under a sky, drawn by Mitsuba's `path`, as 8-bit JPEGs with random exposures (±1 EV), white balances
-(±10 %) and a vignetting of 30 %: `phone.relight_psnr_l`, `phone.albedo_psnr_scaled` (factor per channel),
-`phone.exposure_error` (largest error of a gain, relative), `phone.seconds`; means over the assets, the worst exposure.
+`phone`, and on request `bounds` and `known`: two assets photographed as by a phone (`captures_phone.py`).
 
 `metals`: DamagedHelmet and WaterBottle with their own maps, 16 views of 256² x an environment in three positions, as
 `benchmarks.material_recovery --maps own_soft` draws and fits them; of both the worse: `metals.metallic_right` (share of
@@ -25,31 +23,26 @@ the surface that three cameras see), `metals.albedo_psnr` and `calibration.worst
 `--only plan`: plan against time of five jobs (`captures_plan.py`). `--only cycles`: pictures that Blender drew
 (`captures_cycles.py`).
 
---quick fits textures of 256², texel by texel alone; the phone's pictures have 160 pixels a side,
-the metals' 96.
+--quick fits textures of 256², texel by texel alone; the phone's pictures have 160 pixels a side, those of
+`known` and `metals` 96.
 """
 
 import json
-import sys
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
 from benchmarks import material_recovery as recovery
-from benchmarks import recovery_pictures as drawing
 from benchmarks.captures_cycles import cycles
+from benchmarks.captures_phone import PARTS, QUICK
 from benchmarks.captures_plan import plans, watched
 from benchmarks.common import finish, parser, run_mistyle
-from benchmarks.material_metrics import align_channels, map_errors, orb_mask, psnr_ldr
-from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, seen, truth
+from benchmarks.recovery_truth import data_folder
 from mistyle.atlas.texels import rasterise
-from mistyle.core.camera import pixel_centres
 from mistyle.core.capture import Captures, subset
 from mistyle.core.image import bilinear, luminance, nearest_fill, srgb_from_linear
 from mistyle.core.light import Environment, environment_directions
@@ -57,21 +50,16 @@ from mistyle.core.maps import Texels
 from mistyle.fitting.pipeline.first_look import median_textures
 from mistyle.fitting.pipeline.photometry import exif_exposure
 from mistyle.fitting.pipeline.pictures import read_averaged
-from mistyle.io.cameras.camera_files import transforms
 from mistyle.io.cameras.captures import read_captures, read_shots
-from mistyle.io.read import read_hdr
 from mistyle.io.read_mesh import read_mesh
 from mistyle.io.store.records import load_record
 from mistyle.measure.metrics import psnr
 from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
-from mistyle.solver.photometry.record import coordinates, corrected, fall_terms
+from mistyle.solver.photometry.record import corrected
 from mistyle.solver.photometry.solve import solve_photometry
 from mistyle.solver.texels.gbuffer import open_sky
 
-QUICK = ["--atlas", 256, "--set", "recover.solver=texels", "--set", "recover.bounces=0"]
 STEP = 3  # texels between the two of a pair
-PHONES, SKY = ("suzanne", "avocado"), "kiara_1_dawn_1k.hdr"
-VIEWS, FALL = 24, np.array([-0.25, -0.1, np.log(0.7) + 0.35])
 
 
 @dataclass(frozen=True)
@@ -89,7 +77,7 @@ class CastleRun:
 
 def main() -> None:
     options = parser(__doc__ or "")
-    parts = ("castle", "phone", "metals", "plan", "cycles")
+    parts = ("castle", *PARTS, "metals", "plan", "cycles")
     options.add_argument("--only", choices=parts, action="append", help="only this part (repeatable)")
     options.add_argument("--keep", type=Path, help="folder for the runs, to look at afterwards")
     chosen = options.parse_args()
@@ -98,8 +86,9 @@ def main() -> None:
         place = chosen.keep or Path(scratch)
         if "castle" in (chosen.only or ["castle"]):
             figures |= castle(place / "castle", chosen.quick)
-        if "phone" in (chosen.only or ["phone"]):
-            figures |= phone(place / "phone", chosen.quick)
+        for part, run in PARTS.items():
+            if part in (chosen.only or ["phone"]):
+                figures |= run(place / part, chosen.quick)
         if "metals" in (chosen.only or ["metals"]):
             figures |= metals(place / "metals", chosen.quick)
         if "plan" in (chosen.only or []):
@@ -113,7 +102,7 @@ def castle(out: Path, quick: bool) -> dict[str, float]:
     """Fit the castle into `out` and measure it."""
     folder = data_folder() / "photographs" / "castle"
     words = ["fit", folder / "scene_mesh.ply", folder, "-o", out, "--align", "--light", "unknown", "--hold-out", 2]
-    words += ["--preset", "draft", *(QUICK if quick else [])]
+    words += ["--preset", "draft", *(["--atlas", 256, *QUICK] if quick else [])]
     plan = run_mistyle(*words, "--dry-run")
     ran = watched(words, out)
     figures = {"castle.seconds": ran.seconds, "castle.cpu_seconds": ran.cpu}
@@ -221,17 +210,6 @@ def brightest(light: Environment) -> Float[np.ndarray, "3"]:
     return towards[int(luminance(light.radiance).argmax())]
 
 
-def phone(place: Path, quick: bool) -> dict[str, float]:
-    """Both assets photographed, fitted and relit."""
-    rows = [_phone(name, place / name, 160 if quick else 320, quick) for name in PHONES]
-    keys = ("relight_psnr_l", "albedo_psnr_scaled", "seconds")
-    figures = {f"phone.{key}": float(np.mean([row[key] for row in rows])) for key in keys}
-    figures["phone.exposure_error"] = max(row["exposure_error"] for row in rows)
-    for name, row in zip(PHONES, rows, strict=True):
-        print(name, {key: round(value, 3) for key, value in row.items()}, file=sys.stderr, flush=True)
-    return figures
-
-
 def metals(place: Path, quick: bool) -> dict[str, float]:
     """The worse of two assets with metal and dark gloss, lit by an environment."""
     side, spp = (96, 32) if quick else (256, 128)
@@ -248,68 +226,6 @@ def metals(place: Path, quick: bool) -> dict[str, float]:
     for name in ("metallic_right", "albedo_psnr"):
         figures[f"metals.{name}"] = min(row[name] for row in rows)
     return figures | {"calibration.worst": max(row["calibration_worst"] for row in rows)}
-
-
-def _phone(name: str, place: Path, side: int, quick: bool) -> dict[str, float]:
-    cameras = [replace(c, focal=1.2 * c.focal) for c in drawing.fibonacci(VIEWS, side)]
-    file = find_asset(name, data_folder())
-    known = truth(file, name, cameras[0], ASSETS[name][1])
-    radiance = read_hdr(data_folder() / "hdri" / SKY)
-    sky = Environment(radiance, scale=drawing.HDRI_MEAN / float(radiance.mean()), file=SKY)
-    shots = [drawing.Shot(camera, (sky,)) for camera in cameras]
-    pictures = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=16 if quick else 64)
-    gain = photograph(place / "shots", shots, pictures, np.random.default_rng(len(name)))
-    size = len(known.texels[0].covered)
-    words = ["fit", file, place / "shots", "-o", place / "out", "--masks", place / "shots" / "masks"]
-    words += ["--light", "unknown", "--preset", "draft", *(QUICK if quick else []), "--atlas", size]
-    start = time.perf_counter()
-    run_mistyle(*words)
-    result = {"seconds": time.perf_counter() - start}
-    work = place / "out" / "work"
-    found, recovered = load_record(work / "exposures" / "record").photometry, load_record(work / "recover" / "record")
-    solved = found.exposure[:, None] + found.balance
-    result["exposure_error"] = float(np.abs(np.expm1(solved - gain)).max())
-    weights = [area * (count >= 3) for area, count in zip(known.areas, seen(known, cameras), strict=True)]
-    result["albedo_psnr_scaled"] = map_errors(known.maps, recovered.maps, weights).albedo_psnr_aligned
-    result["relight_psnr_l"] = relit(known, recovered.maps, side, quick)
-    return result
-
-
-def photograph(
-    folder: Path, shots: list[drawing.Shot], pictures: list[np.ndarray], rng: np.random.Generator
-) -> Float[np.ndarray, "n 3"]:
-    """Write JPEGs with masks and cameras as a phone takes them; returns their log gains in the gauge of a fit."""
-    (folder / "masks").mkdir(parents=True, exist_ok=True)
-    n = len(shots)
-    exposure, balance = rng.uniform(-1, 1, n) * np.log(2), rng.uniform(np.log(0.9), np.log(1.1), (n, 3))
-    balance -= balance.mean(axis=1, keepdims=True)
-    inside = np.concatenate([p[..., :3][p[..., 3] > 0.99] for p in pictures])
-    level = 0.25 / float(np.quantile(inside, 0.9))
-    for k, (shot, picture) in enumerate(zip(shots, pictures, strict=True)):
-        x = coordinates(shot.camera, pixel_centres(shot.camera.size))
-        taken = level * picture[..., :3] * np.exp(exposure[k] + balance[k] + (fall_terms(x) @ FALL)[..., None])
-        encoded = (255 * srgb_from_linear(np.clip(taken, 0, 1).astype(np.float32)) + 0.5).astype(np.uint8)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
-        cv2.imwrite(str(folder / f"{shot.camera.name}.jpg"), encoded[..., ::-1], quality)
-        mask = (255 * (picture[..., 3] > 0.999)).astype(np.uint8)
-        cv2.imwrite(str(folder / "masks" / f"{shot.camera.name}.png"), mask)
-    names = [f"{shot.camera.name}.jpg" for shot in shots]
-    (folder / "transforms.json").write_text(json.dumps(transforms([shot.camera for shot in shots], names)))
-    balance -= balance.mean(axis=0)
-    return (exposure - exposure.mean())[:, None] + balance
-
-
-def relit(known: Truth, maps: Any, side: int, quick: bool) -> float:
-    """Mean PSNR-L under the four unseen lights of `recovery_pictures.unseen`, with a factor per channel."""
-    hdri, errors = data_folder() / "hdri" / "studio_small_03_1k.hdr", []
-    for shots in drawing.unseen(hdri, side, 2 if quick else 4).values():
-        spp = 16 if quick else 64
-        true = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=spp)
-        mine = drawing.render(known.mesh, maps, shots, frame="mikkt", spp=spp)
-        for a, b in zip(true, mine, strict=True):
-            mask = orb_mask(a[..., 3])
-            errors.append(psnr_ldr(a[..., :3], align_channels(a[..., :3], b[..., :3], mask), mask))
-    return float(np.mean(errors))
 
 
 if __name__ == "__main__":

@@ -109,8 +109,8 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--photometry",
         choices=["none", "exposure", "full"],
-        help="solve for exposures, or also white balance, vignetting and veiling light (default: full under unknown "
-        "light for 8-bit pictures without --exposure)",
+        help="solve for exposures, or also white balance, vignetting and veiling light (default: full for 8-bit "
+        "pictures without --exposure, else none)",
     )
     group.add_argument(
         "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"

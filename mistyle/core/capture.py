@@ -1,13 +1,13 @@
 """Reference pictures with known cameras and lights: the data of the material fit."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera, binned
-from mistyle.core.light import Lights
+from mistyle.core.light import Ambient, Lights
 
 Loaded = tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]
 
@@ -75,3 +75,13 @@ def shrunk(captures: Captures, by: Sequence[int]) -> Captures:
         return means.astype(np.float32), np.asarray(valid.reshape(height, factor, width, factor).all(axis=(1, 3)))
 
     return Captures(cameras, captures.lights, load)
+
+
+def shrunk_to(captures: Captures, side: int) -> Captures:
+    """The pictures averaged to at most `side` pixels along their longer side."""
+    return shrunk(captures, [-(-max(camera.size) // side) for camera in captures.cameras])
+
+
+def evenly_lit(captures: Captures) -> Captures:
+    """The captures under white ambient light, so that no pixel counts as one at a shadow's edge."""
+    return replace(captures, lights=((Ambient((1.0, 1.0, 1.0)),),) * len(captures))

@@ -1,4 +1,4 @@
-"""Distinct rows of a table."""
+"""Rows of a table: distinct ones, evenly chosen ones, and medians of groups."""
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
@@ -23,3 +23,22 @@ def distinct(rows: Shaped[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " d"], In
     inverse = np.empty(len(rows), np.int64)
     inverse[order] = np.cumsum(begins) - 1
     return order[begins], inverse
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """At most `most` of the rows 0..count - 1, evenly chosen, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
+
+
+def weighted_medians(
+    group: Int[np.ndarray, " n"], values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, " g"], Float[np.ndarray, " g"]]:
+    """The groups that occur, ascending, and their lower weighted medians: the smallest value up to which a group's
+    values have half of its weight."""
+    order = np.lexsort((values, group))
+    group, values = group[order], values[order]
+    total = np.cumsum(weight[order], dtype=np.float64)
+    ends = np.flatnonzero(np.append(group[1:] != group[:-1], True)) if len(group) else np.zeros(0, np.int64)
+    before = np.concatenate([[0.0], total[ends[:-1]]]) if len(ends) else np.zeros(0)
+    middle = np.searchsorted(total, before + 0.5 * (total[ends] - before))
+    return group[ends], values[np.minimum(middle, ends)]

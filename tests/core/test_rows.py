@@ -1,9 +1,9 @@
-"""Equal rows against NumPy's own way."""
+"""Equal rows against NumPy's own way, rows evenly chosen, medians of groups."""
 
 import numpy as np
 import pytest
 
-from mistyle.core.rows import distinct
+from mistyle.core.rows import distinct, evenly, weighted_medians
 
 
 @pytest.mark.parametrize("kind", [np.int32, np.int64, np.float64])
@@ -23,3 +23,16 @@ def test_as_numpy_finds_them(rng, kind, shape):
 def test_zero_has_no_sign():
     first, inverse = distinct(np.array([[0.0, 1.0], [-0.0, 1.0]]))
     assert first.tolist() == [0] and inverse.tolist() == [0, 0]
+
+
+def test_weighted_medians_by_group():
+    group, values = np.array([2, 0, 2, 0, 2, 5]), np.array([0.9, 0.1, 0.2, 0.3, 0.5, 0.7], np.float32)
+    rows, found = weighted_medians(group, values, np.array([1, 1, 1, 3, 1, 2.0]))
+    assert rows.tolist() == [0, 2, 5] and np.allclose(found, [0.3, 0.5, 0.7])
+    rows, found = weighted_medians(group[:0], values[:0], values[:0])
+    assert len(rows) == len(found) == 0
+
+
+def test_rows_are_chosen_evenly():
+    assert evenly(0, 4) == [] and evenly(1, 4) == [0] and evenly(3, 8) == [0, 1, 2]
+    assert evenly(11, 4) == [0, 3, 7, 10] and len(evenly(100, 48)) == 48

@@ -100,7 +100,7 @@ def test_an_asset_of_the_pictures_exists_before_the_first_pass(shots, tmp_path, 
 def test_the_command_line_takes_both_limits(shots, tmp_path, capsys):
     words = ["fit", str(shots / "bowl.obj"), str(shots / "shots"), "-o", str(tmp_path / "out"), "--dry-run", "--json"]
     plans = []
-    for more in ([], ["--passes", "1"], ["--minutes", "1"], ["--light", "unknown"]):
+    for more in ([], ["--passes", "1"], ["--minutes", "1"], ["--light", "unknown", "--photometry", "full"]):
         assert main([*words, *more]) == 0
         rows = json.loads(capsys.readouterr().out)["stages"]
         plans.append({row["stage"]: row["seconds"] for row in rows})

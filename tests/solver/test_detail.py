@@ -12,7 +12,7 @@ from mistyle.core.capture import in_memory
 from mistyle.render.mitsuba import device
 from mistyle.solver.recover import recover
 from mistyle.solver.texels import detail
-from mistyle.solver.texels.detail import bands, weighted_medians
+from mistyle.solver.texels.detail import bands
 
 COARSE = QUICK.model_copy(update={"iterations": 0, "rounds": 1, "solver_texels": 1000})
 
@@ -46,11 +46,3 @@ def test_the_albedo_has_the_detail_of_the_pictures_and_the_rest_stays(checks, mo
     again = recover(mesh, [texels], captures, COARSE.model_copy(update={"detail": True}), 0)
     assert len(bands([texels], len(captures))) > 2
     assert np.abs(again.maps[0].albedo - fine.maps[0].albedo)[texels.covered].mean() < 1e-3
-
-
-def test_weighted_medians_by_group():
-    group, values = np.array([2, 0, 2, 0, 2, 5]), np.array([0.9, 0.1, 0.2, 0.3, 0.5, 0.7], np.float32)
-    rows, found = weighted_medians(group, values, np.array([1, 1, 1, 3, 1, 2.0]))
-    assert rows.tolist() == [0, 2, 5] and np.allclose(found, [0.3, 0.5, 0.7])
-    rows, found = weighted_medians(group[:0], values[:0], values[:0])
-    assert len(rows) == len(found) == 0

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, resized
-from mistyle.core.capture import Captures, in_memory
+from mistyle.core.capture import Captures, evenly_lit, in_memory
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance
-from mistyle.core.light import Ambient, Directional, Environment, Lights
+from mistyle.core.light import Directional, Environment, Lights
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
+from mistyle.core.rows import evenly
 from mistyle.fitting.light import cells as light_cells
 from mistyle.fitting.light import outdoors
 from mistyle.fitting.light import solve as light_solve
@@ -32,10 +32,10 @@ from mistyle.solver.photometry.material import NOISY, all_samples
 from mistyle.solver.photometry.record import Gains
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import atlas_of, scatter, scatter_to_atlas
-from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, collect_observations
+from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, coarse_observations
 
 SIDE = 192  # pixels along the longer side of the small pictures
-ATLAS, LEAST = 96, 16  # texels a side of the coarse atlas: all sets together, and the least for each
+ATLAS = 96  # texels a side of the coarse atlas, all sets together
 PICTURES = 48  # at most, evenly chosen
 OBSERVATIONS = 30_000  # target number of observations; the time is proportional to it
 STEPS = (10, 12)  # joint steps with even cells, and with finer ones
@@ -79,7 +79,7 @@ def find_light(
     from mistyle.solver.texels.levenberg_marquardt import Options
 
     traced = tracer(mesh)
-    chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
+    chosen = np.array(evenly(len(captures), PICTURES))
     noise = (NOISE, RELATIVE) if gains is None else NOISY
     cameras, texels, observed = _observations(traced, captures, settings, chosen, noise)
     samples, own = None, None
@@ -141,20 +141,10 @@ def _observations(
     from mistyle.render.deferred.image_samples import tangents_of
 
     cameras, pictures, masks = zip(*(_downsampled(captures, int(k)) for k in chosen), strict=True)
-    lit = in_memory(cameras, [(Ambient((1.0, 1.0, 1.0)),)] * len(cameras), pictures, masks)
-    mesh, tangents = traced.mesh, tangents_of(traced.mesh, settings.frame)
-
+    lit = evenly_lit(in_memory(cameras, [()] * len(cameras), pictures, masks))
     options = ObservationOptions(settings.facing, *noise, skies=False, move=0)
-
-    def observed_at(side: int) -> tuple[list[Texels], TexelObservations]:
-        texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
-        return texels, collect_observations(traced, texels, lit, tangents, options)
-
-    side = max(LEAST, int(ATLAS / len(mesh.parts) ** 0.5))
-    texels, observed = observed_at(side)
-    count = len(observed.observations.rgb)
-    if count > OBSERVATIONS:
-        texels, observed = observed_at(max(LEAST, int(side * (OBSERVATIONS / count) ** 0.5)))
+    tangents = tangents_of(traced.mesh, settings.frame)
+    texels, observed = coarse_observations(traced, lit, tangents, options, ATLAS, OBSERVATIONS)
     if not (observed.seen >= recover_prior.LEAST_SEEN).any():
         raise InputRefused(
             f"found no place of the mesh that {recover_prior.LEAST_SEEN} of the pictures show, expected pictures from "

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset
-from mistyle.core.capture import Captures, shrunk, subset
+from mistyle.core.capture import Captures, evenly_lit, shrunk_to, subset
 from mistyle.core.image import luminance, nearest_fill, resize
-from mistyle.core.light import Ambient
-from mistyle.core.maps import Maps, Texels, flat_maps
+from mistyle.core.maps import Maps, Texels, flat_maps, rows_of
+from mistyle.core.rows import evenly, weighted_medians
 from mistyle.fitting.pipeline.files import write
 from mistyle.fitting.pipeline.times import FIRST_PICTURES
 from mistyle.io.store.atomic import digest
@@ -45,9 +45,7 @@ def first_asset(run: Run, asset: Asset, texels: Sequence[Texels], captures: Capt
 
 def first_look(asset: Asset, texels: Sequence[Texels], captures: Captures) -> tuple[Maps, ...]:
     """The maps at the size of `texels`, from few small pictures on a coarse level of the atlas."""
-    chosen = np.unique(np.linspace(0, len(captures) - 1, FIRST_PICTURES).round().astype(int))
-    few = subset(captures, chosen.tolist())
-    few = shrunk(few, [-(-max(camera.size) // SIDE) for camera in few.cameras])
+    few = shrunk_to(subset(captures, evenly(len(captures), FIRST_PICTURES)), SIDE)
     mesh, sizes = asset.mesh, [len(t.covered) for t in texels]
     coarse = [rasterise(mesh, part, min(ATLAS, size)) for part, size in enumerate(sizes)]
     textures = median_textures(tracer(mesh), coarse, few)
@@ -63,22 +61,16 @@ def first_look(asset: Asset, texels: Sequence[Texels], captures: Captures) -> tu
 
 def median_textures(traced: Tracer, texels: Sequence[Texels], captures: Captures) -> list[Texture]:
     """Per texture set the median radiance of the pictures that show a texel, and which texels any picture shows."""
-    lit = replace(captures, lights=((Ambient((1.0, 1.0, 1.0)),),) * len(captures))
-    observed = collect_observations(traced, texels, lit, None, ObservationOptions(skies=False))
-    values, texel = observed.observations.rgb, np.repeat(np.arange(len(observed.texel)), observed.seen)
-    first, count = observed.observations.start[:-1], observed.seen
-    shown = np.flatnonzero(count)
-    median = np.zeros((len(count), 3), np.float32)
-    for c in range(3):
-        ordered = values[np.lexsort((values[:, c], texel)), c]
-        low, high = (first + np.maximum(count - 1, 0) // 2)[shown], (first + count // 2)[shown]
-        median[shown, c] = (ordered[low] + ordered[high]) / 2
+    options = ObservationOptions(skies=False)
+    observed = collect_observations(traced, texels, evenly_lit(captures), None, options)
+    rgb, owner = observed.observations.rgb, np.repeat(observed.texel, observed.seen)
     texture = np.zeros((sum(t.covered.size for t in texels), 3), np.float32)
     known = np.zeros(len(texture), bool)
-    texture[observed.texel], known[observed.texel] = median, count > 0
-    result, begin = [], 0
-    for size in (t.covered.shape for t in texels):
-        part = slice(begin, begin + size[0] * size[1])
-        begin = part.stop
-        result.append((texture[part].reshape(*size, 3), known[part].reshape(size)))
-    return result
+    for c in range(3):
+        rows, texture_c = weighted_medians(owner, rgb[:, c], np.ones(len(owner)))
+        texture[rows, c], known[rows] = texture_c, True
+    sizes = [t.covered.shape for t in texels]
+    return [
+        (texture[part].reshape(*size, 3), known[part].reshape(size))
+        for part, size in zip(rows_of(sizes), sizes, strict=True)
+    ]

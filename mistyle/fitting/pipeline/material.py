@@ -18,6 +18,7 @@ from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
+from mistyle.core.rows import evenly
 from mistyle.fitting.pipeline.budget import check_material, in_files
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.first_look import first_asset
@@ -341,7 +342,7 @@ def measure(
     errors: list[float] = []
     shown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     converted: list[float] = []
-    shown_pictures = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
+    shown_pictures = sorted({*held[:4], *evenly(len(captures), 4)})
     for k in range(len(captures)):
         first = renderer_of(traced, subset(captures, [k]), sizes, chosen, TWICE if k in shown_pictures else 0)
         rendered = [first.image_and_coverage(table, 0)]

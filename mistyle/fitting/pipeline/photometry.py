@@ -24,7 +24,7 @@ def photometry_mode(job: MaterialJob, shots: Sequence[Any]) -> Literal["none", "
     if chosen != "auto":
         return chosen
     encoded = all(shot.picture.suffix.lower() not in LINEAR for shot in shots)
-    return "full" if encoded and job.exposure is None and job.lights == "unknown" else "none"
+    return "full" if encoded and job.exposure is None else "none"
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,8 @@ def match_exposures(
     if mode == "none":
         run.skip(["photometry", "exposures"], ["cameras"])
         return captures, None, None
+    if job.settings.photometry.mode == "auto":
+        run.progress.say("The pictures' exposures are solved; --photometry none takes them as they are.")
     found = run.record(
         "photometry", ["cameras"], [mode, job.settings.photometry.exif],
         lambda report: _solved(job, asset, captures, shots, report),

@@ -1,5 +1,6 @@
 """Estimates of `--dry-run` for a fit to pictures; see jobs/plan.py."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from mistyle.core.light import has_soft
@@ -12,6 +13,7 @@ from mistyle.fitting.pipeline.budget import (
     needs_of,
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.fitting.pipeline.photometry import photometry_mode
 from mistyle.fitting.pipeline.times import FIRST_PICTURES, closing_stages, recover_seconds
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
@@ -30,6 +32,7 @@ LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pict
 PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
 EXPLAINED_SECONDS = 20  # of exposures with a material
 PHOTOMETRY_SECONDS = 12  # the number of points is bounded
+READS = 1.5  # of every picture for each of both
 
 
 def plan_material(job: Any) -> dict[str, Any]:
@@ -39,6 +42,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     shares.
     """
     from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
+    from mistyle.io.cameras.captures import read_shots
 
     s, extent = job.settings, extent_of(job.mesh, job.settings)
     claim_run(job, MATERIAL_STAGES, inputs_of(job))
@@ -47,17 +51,19 @@ def plan_material(job: Any) -> dict[str, Any]:
     sizes = pixels_of(captures)
     texels = extent.sets * s.atlas.size**2
     chosen = check_material(s, sizes, *size)
-    averaged, shown = averaged_pixels(s, sizes), SHOWN if masked(job) else FILLED
-    unknown = job.lights == "unknown"
+    shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
+    averaged, shown = averaged_pixels(s, sizes), SHOWN if masked(shots) else FILLED
+    unknown, reads = job.lights == "unknown", READS * sum(sizes) * PER_READ_PIXEL
+    matched = photometry_mode(job, shots) != "none"
     soft = unknown or has_soft(captures.lights)
     stages = {
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
         "cameras": 1 + PER_ALIGNED * len(sizes) + first_asset_seconds(sizes),
-        **({"photometry": PHOTOMETRY_SECONDS + 1.5 * sum(sizes) * PER_READ_PIXEL} if unknown else {}),
-        **({"exposures": LIGHT_SECONDS + EXPLAINED_SECONDS} if unknown else {}),
+        **({"photometry": PHOTOMETRY_SECONDS + reads} if matched else {}),
+        **({"exposures": EXPLAINED_SECONDS + unknown * LIGHT_SECONDS + reads} if matched else {}),
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        **({"light": 1} if unknown else {}),
+        **({"light": 1 if matched else LIGHT_SECONDS} if unknown else {}),
         "recover": recover_seconds(s, averaged, COVERED * texels, soft, shown),
         **closing_stages(s, averaged, texels, soft, shown),
     }
@@ -80,11 +86,8 @@ def first_asset_seconds(sizes: list[int]) -> float:
     return 1 + sum(sizes) * min(1, FIRST_PICTURES / len(sizes)) * PER_READ_PIXEL
 
 
-def masked(job: Any) -> bool:
+def masked(shots: Sequence[Any]) -> bool:
     """Whether a picture has a mask or alpha, so that the object is likely to fill less of it."""
-    from mistyle.io.cameras.captures import read_shots
-
-    shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
     return any(shot.mask is not None or shot.alpha_of is not None for shot in shots)
 
 

@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.camera import of_corners
-from mistyle.core.capture import Captures, shrunk
+from mistyle.core.capture import Captures, shrunk_to
 from mistyle.core.image import luminance, srgb_from_linear
+from mistyle.core.rows import evenly
 from mistyle.jobs.report.charts import Chart
 from mistyle.jobs.report.page import ReportPicture, Step
 from mistyle.render.mitsuba.draw import Tracer
@@ -60,8 +61,8 @@ def _fall(found: Photometry) -> list[float]:
 def ignored_pictures(traced: Tracer, captures: Captures, found: Photometry) -> list[ReportPicture]:
     """At most MOST pictures, evenly chosen, with their ignored pixels coloured."""
     cells = dict(zip(found.names, found.ignored, strict=True))
-    chosen = np.unique(np.linspace(0, len(captures) - 1, MOST).round().astype(int)).tolist()
-    small = shrunk(captures, [max(1, -(-max(camera.size) // LONGEST)) for camera in captures.cameras])
+    chosen = evenly(len(captures), MOST)
+    small = shrunk_to(captures, LONGEST)
     return [_picture(traced, small, k, cells[small.cameras[k].name]) for k in chosen]
 
 

@@ -60,7 +60,7 @@ class PhotometrySettings(BaseModel):
     mode: Literal["auto", "none", "exposure", "full"] = Field(
         default="auto",
         description="solve for each picture's exposure, or (full) also its white balance, the vignetting of all and "
-        "veiling light; auto: full for 8-bit pictures under unknown light without given exposures, else none",
+        "veiling light; auto: full for 8-bit pictures without given exposures, else none",
     )
     exif: bool = Field(default=True, description="use EXIF's exposure time, f-number and ISO speed as a prior")
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from mistyle.core.camera import Camera
 from mistyle.core.image import overlap
 from mistyle.core.mesh import Mesh
+from mistyle.core.rows import evenly
 from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.solver.cameras.align import shrunk
@@ -62,7 +63,7 @@ def check_outlines(
             seen.append(shrunk(camera, outline, SIDE)[:2])
             overlaps.append(overlap(drawn(seen[-1][0]), seen[-1][1]))
         progress(len(overlaps) / len(cameras))
-    few = [seen[k] for k in np.unique(np.linspace(0, len(seen) - 1, min(FEW, len(seen))).round().astype(int))]
+    few = [seen[k] for k in evenly(len(seen), FEW)]
 
     def mean(degrees: float) -> float:
         turn = similarity(1.0, Rotation.from_euler("x", degrees, degrees=True).as_matrix(), np.zeros(3))

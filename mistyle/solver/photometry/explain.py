@@ -44,8 +44,9 @@ def explained(
     """The photometry that a material explains best, and whether it was solved with the material.
 
     `captures` are those as photographed, under known light; `start` are gains to begin at. Metallic is free whatever is
-    fitted later. Nothing is corrected where the gains do not lower the difference between pictures and model to LOWER
-    of that of the pictures as photographed. A veil of `found` stays unless a material explains the pictures without.
+    fitted later. Nothing is corrected where the gains make no picture's difference from the model smaller, by AGREE
+    and to LOWER of that as photographed: errors of the model (indirect light) pass for gains of some percent and lower
+    it by up to 0.008. A veil of `found` stays unless a material explains the pictures without.
     """
     samples = material_samples(traced, captures, tangents)
     problem, n = problem_of(samples, replace(options, metallic=True)), len(captures)
@@ -60,7 +61,8 @@ def explained(
         return found, False
     chosen = fit if veiled else min((fit, points), key=lambda each: each.spread)
     bare = without_gains(found)
-    if chosen.spread > LOWER * plain.spread or _small(chosen.gains):
+    better = (chosen.spreads < LOWER * plain.spreads) & (chosen.spreads < plain.spreads - AGREE)
+    if not better.any() or _small(chosen.gains):
         note = "Photometry: different exposures do not explain the pictures better; nothing was corrected."
         return replace(bare, spread=(plain.spread, plain.spread), notes=(note,)), False
     result = with_gains(bare, chosen.gains, (plain.spread, chosen.spread))

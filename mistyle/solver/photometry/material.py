@@ -18,14 +18,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
-from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, shrunk
+from mistyle.core.capture import Captures, shrunk_to
 from mistyle.core.light import has_soft
-from mistyle.core.maps import Texels
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
 from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
@@ -39,15 +37,16 @@ from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Poi
 from mistyle.solver.texels.observations import (
     ObservationOptions,
     TexelObservations,
-    collect_observations,
+    coarse_observations,
     observation_std,
     points_of,
 )
 from mistyle.solver.texels.rounds import CLASSES, STARTS, best, best_by_region
 
 SIDE = 256  # pixels along the longer side of the small pictures
-ATLAS, LEAST_SIDE = 128, 16  # texels a side of the coarse atlas, all sets together, and of each set at least
+ATLAS = 128  # texels a side of the coarse atlas, all sets together
 LEAST_EACH = 300  # observations of a picture, at least on average
+SHOWN = 12  # observations from which on a picture has an exposure of its own, and a spread
 CELLS = 256  # of soft light: highlights of metals must not depend on where a cell is
 OBSERVATIONS = 20_000  # at most, about
 MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.6, 0.0)  # prior of a texel: a sample of a bumpy surface, hardly tilted
@@ -66,7 +65,7 @@ LONGEST = 1.0  # largest change of a log gain in a step
 # Standard deviations of exposures, balances and vignetting around 0, and of those not solved for; INDEPENDENT is the
 # share of independent observations.
 EXPOSURE, BALANCE, FALL, FIXED = 1.0, 0.2, 0.5, 1e-4
-INDEPENDENT = 0.02
+INDEPENDENT = 0.1
 
 
 @dataclass(frozen=True)
@@ -87,6 +86,11 @@ class MaterialSamples:
         return len(self.rig.eye)
 
     @property
+    def shown(self) -> Int[np.ndarray, " n"]:
+        """Number of observations of each picture."""
+        return np.bincount(self.observations.picture, minlength=self.pictures)
+
+    @property
     def owner(self) -> Int[np.ndarray, " o"]:
         """Each observation's texel."""
         return np.repeat(np.arange(len(self.points.position)), np.diff(self.observations.start))
@@ -94,11 +98,13 @@ class MaterialSamples:
 
 @dataclass(frozen=True)
 class MatchedMaterial:
-    """Gains, the robust cost of their texels, and the robust log difference between pictures and model."""
+    """Gains, the robust cost of their texels, and the robust log difference between pictures and model: of all, and of
+    each picture, 0 for those with fewer than SHOWN observations."""
 
     gains: Gains
     cost: float
     spread: float
+    spreads: Float[np.ndarray, " n"]
 
 
 def material_samples(
@@ -108,19 +114,10 @@ def material_samples(
 ) -> MaterialSamples:
     """The observations of a coarse atlas in small pictures."""
     mesh = traced.mesh
-    small = shrunk(captures, [-(-max(camera.size) // SIDE) for camera in captures.cameras])
+    small = shrunk_to(captures, SIDE)
     options = ObservationOptions(FACING, *NOISY, skies=False, move=0)
-
-    def observed_at(side: int) -> tuple[list[Texels], TexelObservations]:
-        texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
-        return texels, collect_observations(traced, texels, small, tangents, options)
-
-    side = max(LEAST_SIDE, int(ATLAS / len(mesh.parts) ** 0.5))
-    texels, observed = observed_at(side)
-    count, most = len(observed.observations.rgb), max(OBSERVATIONS, LEAST_EACH * len(captures))
-    if count > most:
-        side = max(LEAST_SIDE, int(side * (most / count) ** 0.5))
-        texels, observed = observed_at(side)
+    most = max(OBSERVATIONS, LEAST_EACH * len(captures))
+    texels, observed = coarse_observations(traced, small, tangents, options, ATLAS, most)
     if has_soft(captures.lights):
         position, normal, _ = points_of(texels)
         sky = open_sky(traced, position, normal, even_directions(CELLS).astype(np.float32))
@@ -222,8 +219,10 @@ def solve_with_material(
     *,
     full: bool = True,
 ) -> MatchedMaterial:
-    """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures."""
-    work, gains = _Solve(samples, problem), start
+    """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures. A picture with
+    fewer than SHOWN observations keeps the mean exposure."""
+    work, shown = _Solve(samples, problem), samples.shown >= SHOWN
+    gains = Gains(np.where(shown[:, None], start.gain - start.gain[shown].mean(axis=0), 0), start.vignetting)
     work.scale = FIRST_SCALE
     work.target(gains)
     values = work.anew()
@@ -232,7 +231,7 @@ def solve_with_material(
         work.target(gains)
         values = work.texels(values).values if k % RESTARTS else work.anew(values)
         system = reduced_system(samples, problem, values, work.y, work.weight)
-        change = np.clip(_step(system, gains, full), -LONGEST, LONGEST)
+        change = np.clip(_step(system, gains, full, shown), -LONGEST, LONGEST)
         gains = gains.moved(change)
         work.target(gains)
         values = work.texels(values).values
@@ -252,9 +251,11 @@ def fixed_gains(samples: MaterialSamples, problem: Problem, gains: Gains) -> Mat
 
 def _fit_of(work: _Solve, gains: Gains, solution: Solution) -> MatchedMaterial:
     f, y = np.maximum(work.problem.predict(solution.values), LEAST), np.maximum(work.y, LEAST)
-    weight = y**2 / (y**2 + DARK**2)
-    spread = 1.4826 * weighted_median(np.abs(np.log(y / f)).ravel(), weight.ravel())
-    return MatchedMaterial(gains, work.cost(solution), spread)
+    weight, apart = y**2 / (y**2 + DARK**2), 1.4826 * np.abs(np.log(y / f))
+    spreads, picture = np.zeros(len(gains.gain)), work.samples.observations.picture
+    for k in np.flatnonzero(work.samples.shown >= SHOWN):
+        spreads[k] = weighted_median(apart[picture == k].ravel(), weight[picture == k].ravel())
+    return MatchedMaterial(gains, work.cost(solution), weighted_median(apart.ravel(), weight.ravel()), spreads)
 
 
 @dataclass(frozen=True)
@@ -352,10 +353,11 @@ def gain_prior(n: int, full: bool) -> Float[np.ndarray, "m m"]:
     return matrix / INDEPENDENT
 
 
-def _step(system: ReducedSystem, gains: Gains, full: bool) -> Float[np.ndarray, " m"]:
-    """The change of gains and vignetting; the gains of each channel keep their mean at 0."""
+def _step(system: ReducedSystem, gains: Gains, full: bool, shown: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+    """The change of gains and vignetting; the gains of each channel keep their mean at 0, those of pictures that are
+    not `shown` keep theirs."""
     n, x = len(gains.gain), np.concatenate([gains.gain.ravel(), gains.vignetting])
     held = gain_prior(n, full)
     level = float(np.trace(system.matrix)) / len(x)
-    held[: 3 * n, : 3 * n] += level * np.kron(np.ones((n, n)), np.eye(3))
+    held[: 3 * n, : 3 * n] += level * np.kron(np.outer(shown, shown) + n * np.diag(~shown), np.eye(3))
     return np.linalg.solve(system.matrix + held, system.gradient - held @ x)

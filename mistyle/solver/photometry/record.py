@@ -42,7 +42,6 @@ class Photometry:
     balance     log gain of each channel relative to the picture's exposure
     vignetting  a₁, a₂, a₃ of all pictures
     veil        coefficients of 1, x, y, x², xy, y² per channel, in units of the corrected radiance
-    deviation   standard deviation of each log exposure, of patches of the surface as independent samples
     spread      robust relative difference of a point between pictures: as photographed, and corrected
     ignored     cells of each picture (a grid over it) whose points other pictures show otherwise; none where empty
     applied     False where the pictures agree already, so that nothing is corrected
@@ -54,7 +53,6 @@ class Photometry:
     balance: Float[np.ndarray, "n 3"]
     vignetting: Float[np.ndarray, "3"]
     veil: Float[np.ndarray, "n 6 3"]
-    deviation: Float[np.ndarray, " n"]
     spread: tuple[float, float]
     ignored: tuple[Bool[np.ndarray, "_ _"], ...]
     applied: bool
@@ -149,7 +147,7 @@ def unchanged(captures: Captures, notes: tuple[str, ...]) -> Photometry:
     names = tuple(camera.name for camera in captures.cameras)
     nothing = np.zeros((n, 3))
     return Photometry(
-        names, np.zeros(n), nothing, np.zeros(3), np.zeros((n, VEIL_TERMS, 3)), np.full(n, np.inf), (0.0, 0.0),
+        names, np.zeros(n), nothing, np.zeros(3), np.zeros((n, VEIL_TERMS, 3)), (0.0, 0.0),
         (np.zeros((1, 1), bool),) * n, False, notes,
     )  # fmt: skip
 

@@ -24,8 +24,8 @@ from scipy import sparse
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, shrunk
-from mistyle.core.light import Ambient, Directional, Lights, Point
+from mistyle.core.capture import Captures, evenly_lit, shrunk_to
+from mistyle.core.light import Directional, Lights, Point
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.ignored import ignored_cells
 from mistyle.solver.photometry.least_squares import LinearFit, one_hot, solve
@@ -117,7 +117,7 @@ def solve_photometry(
     residual, scale = _residuals(samples, chosen, veil)
     ignored = ignored_cells(residual, scale, samples.picture, _share(samples, captures), shapes)
     return _gauged(Photometry(
-        names, chosen.gain.mean(axis=1), chosen.gain, chosen.vignetting, veil, _deviation(chosen), (before, after),
+        names, chosen.gain.mean(axis=1), chosen.gain, chosen.vignetting, veil, (before, after),
         ignored, not agree, tuple(notes),
     ))  # fmt: skip
 
@@ -132,10 +132,10 @@ def _share(samples: PointSamples, captures: Captures) -> Float[np.ndarray, "o 2"
 def collect_points(
     traced: Tracer, captures: Captures, seed: int = 0, progress: Callable[[float], None] = lambda done: None
 ) -> PointSamples:
-    """Observations of the mesh's points in small pictures; silhouettes and saturated pixels are left out."""
+    """Observations of the mesh's points in small pictures; silhouettes, saturated pixels and shadows of known lights
+    are left out."""
     mesh, lights = traced.mesh, captures.lights
-    lit = replace(captures, lights=((Ambient((1.0, 1.0, 1.0)),),) * len(captures))
-    small = shrunk(lit, [-(-max(camera.size) // SIDE) for camera in captures.cameras])
+    small = shrunk_to(captures if all(lights) else evenly_lit(captures), SIDE)
     texels = [rasterise(mesh, part, max(16, int(ATLAS / len(mesh.parts) ** 0.5))) for part in range(len(mesh.parts))]
     options = ObservationOptions(FACING, skies=False, move=0)
     observed = collect_observations(traced, texels, small, None, options, progress)
@@ -400,15 +400,6 @@ def _with_exif(response: Response, exif: Float[np.ndarray, " n"]) -> Response:
     )
     x = x + gain @ (target - rows @ x)
     return Response(x[: 3 * n].reshape(n, 3), x[3 * n :], response.covariance - gain @ rows @ response.covariance)
-
-
-def _deviation(response: Response) -> Float[np.ndarray, " n"]:
-    """Standard deviation of each log exposure relative to the mean of all."""
-    n = len(response.gain)
-    rows = np.kron(np.eye(n), np.full((1, 3), 1 / 3))
-    rows = rows - rows.mean(axis=0)
-    block = response.covariance[: 3 * n, : 3 * n]
-    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, block, rows), 0))
 
 
 def _gauged(found: Photometry) -> Photometry:

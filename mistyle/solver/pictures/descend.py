@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.maps import place_of
+from mistyle.core.rows import evenly
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import COLUMNS, SOLVED, TILT, MaterialTable
 from mistyle.solver.context import FitContext
@@ -203,6 +204,5 @@ def _note_stopped(context: FitContext, stopped: list[tuple[int, str, int]]) -> N
 
 def total_loss(renderer: "MaterialRenderer", table: MaterialTable, settings: RecoverSettings) -> float:
     """Mean loss over the pictures, or over JUDGES of them, evenly spaced."""
-    uploaded, last = renderer.upload(table), len(renderer.captures) - 1
-    chosen = np.unique(np.linspace(0, last, min(JUDGES, last + 1)).round().astype(int)).tolist()
+    uploaded, chosen = renderer.upload(table), evenly(len(renderer.captures), JUDGES)
     return float(np.mean([np.array(renderer.step(uploaded, [k], settings.loss)[0])[0] for k in chosen]))

@@ -16,6 +16,7 @@ from mistyle.core.capture import Captures
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
+from mistyle.core.rows import evenly
 from mistyle.render.deferred import pyramid as laplacian
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.mitsuba import device
@@ -83,7 +84,7 @@ def polish(
     device.use()
     job = _Job(mesh, maps, captures, settings)
     steps, spp = settings.steps, settings.spp
-    judges = np.unique(np.linspace(0, len(captures) - 1, JUDGES).round().astype(int)).tolist()
+    judges = evenly(len(captures), JUDGES)
     first = values = job.values()
     before = job.judge(first, judges, spp, seed)
     moments = {p.key: laplacian.start(p.shape) for p in job.chosen}

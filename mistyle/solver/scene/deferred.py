@@ -17,6 +17,7 @@ from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Directional, Point
 from mistyle.core.mesh import Mesh
+from mistyle.core.rows import evenly
 from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live import walk as scene_walk
@@ -138,7 +139,7 @@ class DeferredRenderer:
 
         sizes = [(2, 2) if m is None else m.size for m in self.materials]
         bumped = any("normalmap" in m.roles for m in self.materials if m is not None)
-        looked = np.unique(np.linspace(0, len(views) - 1, CHECKS).round().astype(int)).tolist()
+        looked = evenly(len(views), CHECKS)
         pairs = {k: [_picture(scene, engine, views[k].sensor, 2 * k + j) for j in (0, 1)] for k in looked}
 
         def renderer(flip: bool, shadowing: bool, subsamples: int, **more: Any) -> MaterialRenderer:

@@ -11,9 +11,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from mistyle.core.maps import Texels
+from mistyle.core.rows import weighted_medians
 from mistyle.render.deferred.material_table import ALBEDO, SOLVED, MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.settings import DETAILED
@@ -84,16 +84,3 @@ def _write_albedo(table: MaterialTable, band: Observed, direct: DirectCaptures) 
         ratio = np.clip(rgb[bright, c] / linear[bright, c], 0, 1)
         rows, median = weighted_medians(texel[bright], ratio, linear[bright, c])
         table[observed.texel[rows], c] = median
-
-
-def weighted_medians(
-    group: Int[np.ndarray, " n"], values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]
-) -> tuple[Int[np.ndarray, " g"], Float[np.ndarray, " g"]]:
-    """The groups that occur, ascending, and their lower weighted medians."""
-    order = np.lexsort((values, group))
-    group, values = group[order], values[order]
-    total = np.cumsum(weight[order], dtype=np.float64)
-    ends = np.flatnonzero(np.append(group[1:] != group[:-1], True)) if len(group) else np.zeros(0, np.int64)
-    before = np.concatenate([[0.0], total[ends[:-1]]]) if len(ends) else np.zeros(0)
-    middle = np.searchsorted(total, before + 0.5 * (total[ends] - before))
-    return group[ends], values[np.minimum(middle, ends)]

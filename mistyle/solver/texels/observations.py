@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt
 
 from mistyle.atlas.frames import texel_frames
-from mistyle.atlas.texels import beside
+from mistyle.atlas.texels import beside, rasterise
 from mistyle.core.camera import Camera, by_camera, of_corners
 from mistyle.core.capture import Captures
 from mistyle.core.image import erode
@@ -28,6 +28,7 @@ REACH = 2.5  # largest distance of the four pixels from the texel, in pixel widt
 LIFT = 0.5  # largest distance from its tangent plane, in the same unit
 MOVED = 4.0  # a look-up that moved by d pixels has 1 + MOVED d² times the standard deviation
 PERCENTILE = 95.0  # percentile of the observed radiance, the unit of the noise
+COARSEST = 16  # texels a side of a set in `coarse_observations`, at least
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,28 @@ def collect_observations(
         views[visible.texel[any_light]] += 1
         progress((done + 1) / max(len(captures) / max(len(group), 1), 1))
     return _assemble(texel, points, captures, parts, views, options)
+
+
+def coarse_observations(
+    traced: Tracer,
+    captures: Captures,
+    tangents: Float[np.ndarray, "f 3 4"] | None,
+    options: ObservationOptions,
+    side: int,
+    most: int,
+) -> tuple[list[Texels], TexelObservations]:
+    """A coarse atlas and its observations: about `side` x `side` texels, all sets together, fewer where `most`
+    observations allow less; each set has at least COARSEST texels a side."""
+    mesh = traced.mesh
+
+    def observed_at(size: int) -> tuple[list[Texels], TexelObservations]:
+        texels = [rasterise(mesh, part, size) for part in range(len(mesh.parts))]
+        return texels, collect_observations(traced, texels, captures, tangents, options)
+
+    each = max(COARSEST, int(side / len(mesh.parts) ** 0.5))
+    texels, observed = observed_at(each)
+    count = len(observed.observations.rgb)
+    return (texels, observed) if count <= most else observed_at(max(COARSEST, int(each * (most / count) ** 0.5)))
 
 
 def covered_rows(texels: Sequence[Texels]) -> Int[np.ndarray, " n"]:
