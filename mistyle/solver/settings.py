@@ -165,11 +165,6 @@ class RecoverSettings(BaseModel):
         return value
 
 
-def under_soft_light(settings: RecoverSettings) -> RecoverSettings:
-    """The settings under soft light: without joint steps, which would be slow, and within `soft_bounces`."""
-    return settings.model_copy(update={"joint": 0, "bounces": min(settings.bounces, settings.soft_bounces)})
-
-
 def measured_subsamples(settings: RecoverSettings, soft: bool) -> int:
     """Samples a pixel of the pictures that measure a fit: at least LEAST_MEASURED, so that edges are averaged."""
     return max(settings.soft_subsamples, LEAST_MEASURED) if soft else settings.subsamples

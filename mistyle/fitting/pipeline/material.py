@@ -26,6 +26,7 @@ from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
 from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
+from mistyle.fitting.pipeline.times import running
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs.edits import asset_stage, tell_edits
@@ -101,17 +102,18 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     claim_run(job, MATERIAL_STAGES, inputs_of(job))
     check(s)
     captures = references_of(job)
-    check_material(s, pixels_of(captures))
+    needed = running(s, has_soft(captures.lights) or job.lights == "unknown", s.atlas.size**2)
+    check_material(needed, pixels_of(captures))
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
     captures = in_working_space(captures, shots, s.colour)
     pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
-    files_at = job.out / "work" if in_files(s, pixels_of(captures)) else None
+    files_at = job.out / "work" if in_files(needed, pixels_of(captures)) else None
     with Run(job, progress, MATERIAL_STAGES) as run, memory.within(1e9 * allowed(s).gb, files_at):
         start_engines(s)
         asset = run.record(
             "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
         )
-        check_material(s, pixels_of(captures), *size_of(asset))
+        check_material(needed, pixels_of(captures), *size_of(asset))
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
         read_as = [shot.pixels for shot in shots]
         key_inputs = [pictures, read_as, [vars(c) for c in captures.cameras], captures.lights]
