@@ -76,7 +76,8 @@ class Recovered:
     seen        number of pictures that observed the texel in the light
     views       number of different cameras that did
     trace       values per round and step, by name
-    residuals   per picture by its name: root mean square of reference - render, relative to the reference's
+    residuals   per picture by its name: root mean square of reference - render, relative to the reference's; none
+                where `Limits` leave them out
     notes       sentences for the report
     passes      number of passes, and how many were `planned`
     """
@@ -118,12 +119,14 @@ class Reached:
 @dataclass(frozen=True)
 class Limits:
     """When a recovery ends: after so many `passes`, 0 for all, or with the first pass that would exceed `deadline`, a
-    value of `time.monotonic`. `watch` is called after each pass, `resumed` with the share that a checkpoint holds."""
+    value of `time.monotonic`. `watch` is called after each pass, `resumed` with the share that a checkpoint holds.
+    Without `judged` the pictures' residuals are left out, for whoever measures the maps himself."""
 
     passes: int = 0
     deadline: float = float("inf")
     watch: Callable[[Reached], None] = lambda reached: None
     resumed: Callable[[float], None] = lambda share: None
+    judged: bool = True
 
 
 NO_LIMITS = Limits()
@@ -171,13 +174,8 @@ def recover(
         work = _Work(context, start, journal, StageProgress(report))
         state, planned = work.run(limits)
         table, estimate = work.result(state)
-        renderer = work.renderer(state)
-        uploaded = renderer.upload(table)
-        residuals = {
-            camera.name: _residual(state.direct, renderer.image_and_coverage(uploaded, k), k)
-            for k, camera in enumerate(usable.cameras)
-        }
-    del renderer, uploaded, work
+        residuals = work.residuals(state, table) if limits.judged else {}
+    del work
     give_back()
     progress(1.0)
     return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
@@ -238,6 +236,15 @@ class _Work:
         """The final table of a state, smoothed and with its detail, and the texels' estimate."""
         table, estimate = self.smoothed(state)
         return self.detailed(state, table), estimate
+
+    def residuals(self, state: PassState, table: MaterialTable) -> dict[str, float]:
+        """The relative residual of every picture, by its name."""
+        renderer, direct = self.renderer(state), state.direct
+        uploaded = renderer.upload(table)
+        return {
+            camera.name: _residual(direct, renderer.image_and_coverage(uploaded, k), k)
+            for k, camera in enumerate(direct.captures.cameras)
+        }
 
     def detailed(self, state: PassState, table: MaterialTable) -> MaterialTable:
         """The table with the albedo's detail, where the texels were solved on a coarser level."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from mistyle.solver.settings import (
+    LARGE,
     RecoverSettings,
     all_rounds,
     descent_steps,
@@ -29,7 +30,6 @@ MOST = 512  # pixels along the longer side of an estimate of indirect light
 SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 FILLED = 0.6  # the object's share of a picture without alpha or mask, and the share of its surface there
 OBSERVED = 2**26  # most observations of the per-texel solver, of texels of which one picture sees SEEN
-LARGE = 4_000_000  # pixels of a picture from which it is averaged for a coarser level of that solver
 # Texels of a set that are smoothed at once. Joint steps need JOINT_TEXEL bytes of `recover.memory` for each further
 # texel of the atlas, and JOINT_PIXEL or more for each pixel of the object.
 WHOLE, JOINT_TEXEL, JOINT_PIXEL = 2**22, 750, 240
@@ -199,19 +199,17 @@ def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool
     """Seconds of rendering every picture once, to measure the fit."""
     per = PER_COLLECTED + (settings.soft_measured * (PER_SAMPLE_CELL + PER_VISIBILITY) if soft else 0)
     traced = len(pixels) * (PER_SOFT_TRACED if soft else PER_TRACED)
-    return traced + sum(pixels) * (PER_LOADED + shown * measured_subsamples(settings, soft) * per)
+    samples = sum(n * measured_subsamples(settings, soft, n) for n in pixels)
+    return traced + sum(pixels) * PER_LOADED + shown * samples * per
 
 
 def finishing_seconds(settings: RecoverSettings, size: Size) -> float:
-    """Seconds after the last pass: the loss before and after, smoothing, detail, and the residual of every picture."""
+    """Seconds after the last pass: the loss before and after, smoothing and detail."""
     detail = settings.detail * size.pictures * size.texels * (PER_DETAIL if size.cells else PER_DETAIL / 4)
     judged = min(1.0, JUDGES / size.pictures) if descent_steps(settings) else 0
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
-    # The renderer of the joint steps keeps no samples.
-    joint = size.samples * settings.joint_subsamples / settings.subsamples
-    again = joint * PER_COLLECTED if settings.joint else (1 + 2 * judged) * _collecting(settings, size, size.samples)
-    rendered = (1 + 2 * GRADIENT * judged) * _rendering(settings, size) + size.pixels * PER_LOADED
-    return rendered + again + smoothing + detail
+    rendered = GRADIENT * _rendering(settings, size) + _collecting(settings, size, size.samples)
+    return 2 * judged * rendered + smoothing + detail
 
 
 def _per_sample(settings: RecoverSettings, size: Size) -> float:

@@ -373,7 +373,8 @@ def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any, memory
     """The renderer of the one picture of `captures`; it keeps at most `memory` bytes of the picture's samples."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
-    subsamples = measured_subsamples(chosen, has_soft(captures.lights))
+    height, width = captures.cameras[0].size
+    subsamples = measured_subsamples(chosen, has_soft(captures.lights), height * width)
     options = RenderOptions(
         chosen.model, chosen.frame, subsamples, memory=memory, directions=chosen.soft_measured, gradients=False
     )

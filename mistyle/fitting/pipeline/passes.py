@@ -81,7 +81,7 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
     checkpoints = Checkpoints(
         lambda arrays: checkpoint.save(folder, arrays), checkpoint.load(folder, run.progress.note)
     )
-    limits = Limits(s.passes, deadline, watch, report.begin_at)
+    limits = Limits(s.passes, deadline, watch, report.begin_at, judged=False)
     report.end_in(deadline - time.monotonic())
     try:
         return recover(

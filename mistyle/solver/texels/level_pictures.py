@@ -8,7 +8,7 @@ from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded, shrunk
 from mistyle.core.maps import Texels
 from mistyle.solver.indirect import MOST
-from mistyle.solver.schedule import LARGE
+from mistyle.solver.settings import LARGE
 from mistyle.solver.validate import downsampling_factors
 
 
