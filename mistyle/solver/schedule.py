@@ -43,13 +43,14 @@ PER_OBSERVED = 4e-7  # a texel in a picture in a round, without the solver's ste
 PER_SEEN, PER_OPEN = 4.5e-7, 8e-7  # a pixel where texels are observed, and a texel and a cell, once
 PER_PICTURE, PER_SOFT_PICTURE = 5e-4, 0.008  # a picture, rendered
 PER_TRACED, PER_SOFT_TRACED = 0.01, 0.1  # a picture's kernels, recorded at its first rendering
-PER_LOADED = 1.3e-7  # a pixel of a picture, loaded and compared
+PER_LOADED = 1e-7  # a pixel of a picture, loaded and compared
 PER_SAMPLE, PER_SAMPLE_CELL = 4.5e-9, 1.5e-9  # a sample of a pixel, rendered
 PER_COLLECTED = 2e-7  # a sample of a pixel, collected once
 CACHED = 77  # bytes of a cached sample
 PER_STEP, PER_STEP_TEXEL, GRADIENT = 1.2e-3, 5e-8, 3.5  # a step of Adam, a covered texel in it, and its sample's factor
 PER_VISIBILITY = 1.3e-8  # a sample and a cell, once
 PER_PATH, PER_SOFT_PATH, PER_MISS = 1.3e-7, 3e-7, 5e-9  # a path of indirect light from the object, and from beside it
+SHARED = 0.7  # of a path's seconds, what pictures of one camera share
 PER_LIGHT_PICTURE, PER_LIGHT, PER_VECTOR = 0.01, 7e-7, 1.7e-6  # a picture and a pixel of such an estimate, smoothed
 PER_SMOOTHED = 8.5e-6  # a covered texel in one smoothing pass
 # In a joint step: renderings of all pictures, a pixel of the object, and a texel. Its setup: a sample.
@@ -71,11 +72,13 @@ class Pass:
 
 class Visible(NamedTuple):
     """Means over the pictures: the share of their pixels that shows the object in the light, the share of its surface
-    that a picture observes, and the share of pixels that shows the object at all; see `visible.py`."""
+    that a picture observes, the share of pixels that shows the object at all, and the number of cameras over that of
+    pictures; see `visible.py`."""
 
     shown: float = SHOWN
     seen: float = SEEN
     whole: float = SHOWN
+    cameras: float = 1.0
 
 
 TYPICAL = Visible()
@@ -90,6 +93,7 @@ class Size:
     pixels        of all pictures; `coarse`: of those of the per-texel solver; `shown`: of the object, in all pictures
     samples       rendered samples of all pictures; `rough`: those in rounds of the per-texel solver
     paths         pixels of all estimates of indirect light; `whole`: the share that shows the object
+    cameras       over pictures: those of one camera share their paths
     cells         of soft light, 0 without
     """
 
@@ -103,6 +107,7 @@ class Size:
     rough: float
     paths: float
     whole: float
+    cameras: float
     cells: int
 
     @property
@@ -155,6 +160,7 @@ def size_from(
         visible.shown * coarse * (1 if soft and by > 1 else subsamples),
         sum(min(n, MOST**2) for n in pixels),
         visible.whole,
+        visible.cameras,
         SKY_CELLS if soft else 0,
     )
 
@@ -187,12 +193,20 @@ def runnable(settings: RecoverSettings, soft: bool, texels: float, pixels: float
     return settings.model_copy(update={"joint": joint_steps(settings) if fits else 0})
 
 
-def collecting_seconds(settings: RecoverSettings, size: Size) -> float:
-    """Seconds before the first pass, and of the first rendering of every picture."""
-    samples = size.samples + (size.rough if size.rough < size.samples else 0)
-    rendered = size.pictures * (PER_SOFT_TRACED if size.cells else PER_TRACED) + samples * _per_sample(settings, size)
-    observed = size.pixels * PER_LOADED + size.coarse * PER_SEEN + size.solved * size.cells * PER_OPEN
-    return 1 + observed + rendered
+def observing_seconds(size: Size) -> float:
+    """Seconds before the first pass."""
+    loaded = size.pixels * PER_LOADED * (2 if size.coarse < size.pixels else 1)
+    return 1 + loaded + size.coarse * PER_SEEN + size.solved * size.cells * PER_OPEN
+
+
+def _first_rendering(settings: RecoverSettings, one: Pass, size: Size) -> float:
+    """Seconds of collecting the samples that a pass is the first to render, and of recording the kernels."""
+    if one.begin or one.kind not in ("rounds", "pictures"):
+        return 0.0
+    if one.kind == "pictures" and size.rough == size.samples and settings.solver != "pictures":
+        return 0.0
+    samples = size.rough if one.kind == "rounds" else size.samples
+    return size.pictures * (PER_SOFT_TRACED if size.cells else PER_TRACED) + samples * _per_sample(settings, size)
 
 
 def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool, shown: float) -> float:
@@ -203,10 +217,11 @@ def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool
     return traced + sum(pixels) * PER_LOADED + shown * samples * per
 
 
-def finishing_seconds(settings: RecoverSettings, size: Size) -> float:
-    """Seconds after the last pass: the loss before and after, smoothing and detail."""
+def finishing_seconds(settings: RecoverSettings, size: Size, descended: bool = True) -> float:
+    """Seconds after the last pass: smoothing and detail, and the loss before and after where the steps on whole
+    pictures are over."""
     detail = settings.detail * size.pictures * size.texels * (PER_DETAIL if size.cells else PER_DETAIL / 4)
-    judged = min(1.0, JUDGES / size.pictures) if descent_steps(settings) else 0
+    judged = min(1.0, JUDGES / size.pictures) if descended and descent_steps(settings) else 0
     smoothing = settings.smooth * size.texels * PER_SMOOTHED
     rendered = GRADIENT * _rendering(settings, size) + _collecting(settings, size, size.samples)
     return 2 * judged * rendered + smoothing + detail
@@ -231,7 +246,7 @@ def _collecting(settings: RecoverSettings, size: Size, samples: float) -> float:
 
 def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     """Approximate seconds of a pass."""
-    total = _indirect(one.samples, size, vectors=one.kind == "joint")
+    total = _indirect(one.samples, size, vectors=one.kind == "joint") + _first_rendering(settings, one, size)
     if one.kind in ("solve", "rounds"):
         total += _solving(settings, one, size)
     elif one.kind == "pictures":
@@ -253,6 +268,7 @@ def _indirect(samples: int, size: Size, vectors: bool) -> float:
     if not samples:
         return 0.0
     path = size.whole * (PER_SOFT_PATH if size.cells else PER_PATH) + PER_MISS
+    path *= SHARED * size.cameras + 1 - SHARED
     smoothed = PER_LIGHT + PER_VECTOR * vectors
     return size.pictures * PER_LIGHT_PICTURE + size.paths * (samples * path + smoothed) + size.pixels * PER_LOADED
 
@@ -287,13 +303,13 @@ def _joint(settings: RecoverSettings, one: Pass, size: Size) -> float:
 def whole_seconds(settings: RecoverSettings, size: Size, count: int | None = None) -> float:
     """Seconds of a recovery, of its first `count` passes where given."""
     ordered = schedule(settings, size.pictures, settings.solver != "pictures")[:count]
-    total = collecting_seconds(settings, size) + finishing_seconds(settings, size)
+    total = observing_seconds(size) + finishing_seconds(settings, size, any(one.kind == "pictures" for one in ordered))
     return total + sum(seconds(settings, one, size) for one in ordered)
 
 
 def shares(settings: RecoverSettings, ordered: Sequence[Pass], size: Size) -> list[float]:
     """Cumulative shares of the whole time: before the first pass, and after each."""
-    each = [collecting_seconds(settings, size), *(seconds(settings, one, size) for one in ordered)]
+    each = [observing_seconds(size), *(seconds(settings, one, size) for one in ordered)]
     total, done, result = sum(each), 0.0, []
     for one in each:
         done += one

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.camera import Camera, px_from_world
+from mistyle.core.camera import Camera, by_camera, px_from_world
 from mistyle.core.light import DELTA, Directional, Lights, direction_in_world, has_soft, position_in_world
 from mistyle.core.mesh import SpreadPoints
 from mistyle.solver.schedule import Visible
@@ -27,8 +27,9 @@ def visible_shares(surface: SpreadPoints, cameras: Sequence[Camera], lights: Seq
     for k in chosen:
         pixels.append(cameras[k].size[0] * cameras[k].size[1])
         rows.append(_shares(*surface, cameras[k], lights[k]))
-    shown, seen, whole = np.array(rows).T
-    return Visible(float(shown @ pixels / sum(pixels)), float(seen.mean()), float(whole @ pixels / sum(pixels)))
+    shown, seen, whole = np.array(rows)[:, :3].T
+    shares = (float(shown @ pixels / sum(pixels)), float(seen.mean()), float(whole @ pixels / sum(pixels)))
+    return Visible(*shares, len(by_camera(cameras)) / len(cameras))
 
 
 def _shares(

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, subset
+from mistyle.core.capture import Captures, Loaded, in_memory, shrunk, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
@@ -39,6 +39,7 @@ from mistyle.process import memory
 from mistyle.solver.photometry.record import Photometry
 from mistyle.solver.settings import measured_subsamples
 
+PICTURED = 1600  # pixels along the longer side of the pictures that the report shows, at most
 TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
 
 
@@ -355,7 +356,7 @@ def measure(
         else:
             errors.append(float("nan"))
         if k in shown_pictures:
-            shown[k] = (np.where(valid[..., None], rgb, 0).astype(np.float32), rendered[0][0])
+            shown[k] = _small(captures.cameras[k], (rgb, valid), rendered[0][0])
             scale = float(rendered[0][0][valid].mean()) if valid.any() else 0.0
             if scale > 0:
                 converted.append(float(np.abs(rendered[1][0] - rendered[0][0])[valid].mean()) / scale)
@@ -367,6 +368,14 @@ def measure(
         worst=tuple((k, *pair) for k, pair in shown.items()),
         conversion=float(np.mean(converted)) if converted else float("nan"),
     )
+
+
+def _small(camera: Camera, reference: Loaded, predicted: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """A reference, 0 at its invalid pixels, and its prediction, both averaged to at most PICTURED pixels a side."""
+    pair = in_memory([camera] * 2, [()] * 2, [reference[0], predicted], [reference[1]] * 2)
+    pair = shrunk(pair, [-(-max(camera.size) // PICTURED)] * 2)
+    (rgb, valid), (drawn, _) = pair.load(0), pair.load(1)
+    return np.where(valid[..., None], rgb, 0).astype(np.float32), drawn
 
 
 def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any, memory: float) -> Any:
