@@ -67,7 +67,9 @@ def plans(place: Path, quick: bool, only: Sequence[str] = ()) -> dict[str, float
         figures[f"first_asset.{name}"] = ran.first_asset / ran.seconds
         figures[f"time_left_jump.{name}"] = ran.jump
         figures[f"seconds.{name}"] = ran.seconds
-        print(name, plan["seconds"], ran.summary["seconds"], file=sys.stderr, flush=True)
+        took = ran.summary["seconds"]
+        rows = [f"{row['stage']} {row['seconds']:.1f}/{took.get(row['stage'], 0.0):.1f}" for row in plan["stages"]]
+        print(name, plan["seconds"], "planned/took", *rows, file=sys.stderr, flush=True)
     jumps = [value for name, value in figures.items() if name.startswith("time_left_jump.")]
     return figures | {"time_left_jump": max(jumps)}
 

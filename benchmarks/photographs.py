@@ -13,11 +13,10 @@ pixels wide, and the same averaged until it is two and one: `texel_of_4.…`, `t
 megapixels.
 
 `real_size` (only by `--only real_size`): a fit of an atlas of 4096² to 200 photographs of 12 megapixels (links to 12
-renders) within --memory. Memory does not depend on the number of steps: without --minutes every pass has few. Figures:
-`real_size.pictures`, `.megapixels`, `.atlas`, `.asked_gb`, `.estimate_gb` (the plan), `.peak_gb` (resident, of all
-processes together), `.peak_over_estimate`, `.seconds`, `.passes`, `.passes_planned`, `.whole_seconds_planned`, and
-`.whole_seconds_extrapolated`: all passes of the usual settings, at the ratio of seconds to planned seconds of those
-done. `--quick --atlas 512 --pictures 12 --memory 4` only shows that it works.
+renders) within --memory, of the first --passes alone. Figures: `real_size.pictures`, `.megapixels`, `.atlas`,
+`.asked_gb`, `.plan_gb`, `.peak_gb` (resident, of all processes together), `.peak_over_plan`, `.seconds`, `.passes`,
+`.passes_planned`, `.seconds_planned` and `.seconds_extrapolated`: those of all passes, the latter at the ratio of
+seconds to planned seconds of the passes done. `--quick --atlas 512 --pictures 12 --memory 4` only shows that it works.
 """
 
 import argparse
@@ -31,6 +30,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,7 +47,6 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
 from mistyle.core.maps import flat_maps
 from mistyle.fitting.pipeline.budget import material_gb
-from mistyle.fitting.pipeline.times import recover_seconds
 from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.geometry.lens import Lens, distort
 from mistyle.io.cameras.camera_files import transforms
@@ -57,13 +56,11 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.solver.recover import recover
-from mistyle.solver.schedule import COVERED, FILLED
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.validate import downsampling_factors
 
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024
-FEW = [f"--set=recover.{name}" for name in ("rounds=1", "bounces=1", "bounce_samples=4", "iterations=4")]
 PARTS = ("large", "strong", "real_size")
 FINEST = 4
 
@@ -76,7 +73,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=200, help="of real_size")
     parser.add_argument("--atlas", type=int, default=4096, help="of real_size")
     parser.add_argument("--memory", type=float, default=16.0, help="of real_size, GB")
-    parser.add_argument("--minutes", type=float, default=0.0, help="of real_size; 0: all passes, with few steps")
+    parser.add_argument("--passes", type=int, default=1, help="of real_size: the first that run; 0: all")
     parser.add_argument("--keep", type=Path, help="folder for the photographs and the run, to look at afterwards")
     options = parser.parse_args()
     figures: dict[str, float] = {}
@@ -161,33 +158,36 @@ def photograph(mesh: Path, folder: Path, views: int, size: tuple[int, int], radi
 
 
 def real_size(place: Path, options: argparse.Namespace) -> dict[str, float]:
-    """A fit to so many photographs within a budget, of the first passes or of few steps of each kind: its peak, and the
-    seconds of the whole."""
+    """The first passes of a fit to so many photographs within a budget: its peak, and the seconds of the whole."""
     mesh, folder = find_asset("waterbottle", data_folder()), place / "real_photographs"
-    size, views = ((480, 640), 2) if options.quick else ((3000, 4000), 4)
+    size = (480, 640) if options.quick else (3000, 4000)
+    views = min(4, max(1, options.pictures // 3))
     count = photograph(mesh, folder, views, size, (0.0, 0.0, 0.0), max(1, options.pictures // (3 * views)))
     words = ["fit", mesh, folder, "-o", place / "real_run", "--set", "references.saturation=0.99"]
     words += ["--atlas", options.atlas, "--memory", f"{options.memory:g}G", "--set", "report.frames=4"]
-    planned = run_mistyle(*words, "--dry-run")  # with the usual steps
-    words += ["--minutes", options.minutes] if options.minutes else FEW
+    planned = run_mistyle(*words, "--dry-run")
+    words += ["--passes", options.passes]
+    first = _rows(run_mistyle(*words, "--dry-run"))
+    print({"planned": _rows(planned), "of these passes": first}, file=sys.stderr, flush=True)
     start = time.perf_counter()
     with tree_peak() as most:
         told = run_mistyle(*words)
-    seconds, done = time.perf_counter() - start, told["passes"]["done"]
-    settings = MaterialSettings.model_validate(json.loads((place / "real_run/run.json").read_text())["settings"])
-    pixels, covered = [size[0] * size[1]] * count, COVERED * options.atlas**2
-    first = recover_seconds(settings.model_copy(update={"passes": done}), pixels, covered, False, FILLED)
-    whole = recover_seconds(settings.model_copy(update={"recover": RecoverSettings()}), pixels, covered, False, FILLED)
-    print(json.dumps({"seconds": told["seconds"], "peaks_gb": told["peaks_gb"], "planned": planned}), file=sys.stderr)
-    rest = sum(told["seconds"].values()) - told["seconds"]["recover"]
+    seconds, took = time.perf_counter() - start, told["seconds"]
+    print({"seconds": took, "peaks_gb": told["peaks_gb"], "planned_gb": planned["peaks_gb"]}, file=sys.stderr)
     figures = {
         "pictures": float(count), "megapixels": size[0] * size[1] / 1e6, "atlas": float(options.atlas),
-        "asked_gb": options.memory, "estimate_gb": planned["memory_gb"], "peak_gb": most[0] / 1e9,
-        "peak_over_estimate": most[0] / 1e9 / planned["memory_gb"], "seconds": seconds, "passes": float(done),
-        "passes_planned": float(told["passes"]["planned"]), "whole_seconds_planned": float(planned["seconds"]),
-        "whole_seconds_extrapolated": rest + told["seconds"]["recover"] * whole / first,
+        "asked_gb": options.memory, "plan_gb": planned["memory_gb"], "peak_gb": most[0] / 1e9,
+        "peak_over_plan": most[0] / 1e9 / planned["memory_gb"], "seconds": seconds,
+        "passes": float(told["passes"]["done"]), "passes_planned": float(told["passes"]["planned"]),
+        "seconds_planned": float(planned["seconds"]),
+        "seconds_extrapolated": seconds + took["recover"] * (_rows(planned)["recover"] / first["recover"] - 1),
     }  # fmt: skip
     return {f"real_size.{name}": value for name, value in figures.items()}
+
+
+def _rows(plan: dict[str, Any]) -> dict[str, float]:
+    """The seconds of every stage of a plan."""
+    return {row["stage"]: row["seconds"] for row in plan["stages"]}
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """The mesh of every stage: positions shared by faces, all other attributes per face corner."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,6 +10,7 @@ from mistyle.core.rows import corner_rows, distinct
 
 # Distance from the origin, in radii, beyond which float32 rounds visibly: by 4 mm for 10 km of terrain at 80 km.
 FAR = 8.0
+POINTS = 16_384  # of a surface, to estimate how much of it pictures show
 
 
 @dataclass(frozen=True)
@@ -75,5 +77,37 @@ def face_normals(mesh: Mesh) -> Float[np.ndarray, "f 3"]:
 
 def face_areas(mesh: Mesh) -> Float[np.ndarray, " f"]:
     """Area of every face in working units."""
-    a, b, c = (mesh.positions[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    return _areas(*(mesh.positions[mesh.faces[:, k]].astype(np.float64) for k in range(3)))
+
+
+class SpreadPoints(NamedTuple):
+    """Points spread evenly over a surface, and the unit normals of their faces."""
+
+    position: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+
+
+def spread_points(
+    positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], count: int, rng: np.random.Generator
+) -> SpreadPoints:
+    """`count` points of equal area, stratified over the faces in their order."""
+    areas = _areas(*(positions[faces[:, k]].astype(np.float64) for k in range(3)))
+    steps = (np.arange(count) + rng.random(count)) / count * areas.sum()
+    face = np.minimum(np.searchsorted(np.cumsum(areas), steps), len(areas) - 1)
+    u, v = rng.random((2, count))
+    over = u + v > 1
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    a, b, c = (positions[faces[face, k]].astype(np.float64) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    position = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    return SpreadPoints(position, normal / np.where(length > 0, length, 1))
+
+
+def surface_of(positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> SpreadPoints:
+    """POINTS of a surface, always the same ones."""
+    return spread_points(positions, faces, POINTS, np.random.default_rng(0))
+
+
+def _areas(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Float[np.ndarray, " f"]:
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.image import dilate
-from mistyle.core.mesh import Mesh, face_areas, face_normals
+from mistyle.core.mesh import Mesh, spread_points
 from mistyle.geometry.similarity import degrees_between, fit_similarity, scale_of, similarity
 
 COARSE_POINTS, COARSE_STEPS, COARSE_SURFACE = 250, 12, 5000
@@ -174,15 +174,8 @@ class _Surface:
 
 
 def _surface(mesh: Mesh, count: int, rng: np.random.Generator) -> _Surface:
-    areas = face_areas(mesh)
-    steps = (np.arange(count) + rng.random(count)) / count * areas.sum()
-    face = np.minimum(np.searchsorted(np.cumsum(areas), steps), len(areas) - 1)
-    u, v = rng.random((2, count))
-    over = u + v > 1
-    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
-    a, b, c = (mesh.positions[mesh.faces[face, k]].astype(float) for k in range(3))
-    position = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    return _Surface(position, face_normals(mesh)[face], KDTree(position))
+    points = spread_points(mesh.positions, mesh.faces, count, rng)
+    return _Surface(points.position, points.normal, KDTree(points.position))
 
 
 def _starts(surface: np.ndarray, points: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:

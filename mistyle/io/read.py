@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt16
 
 from mistyle.core.asset import Picture, Pixels
 from mistyle.io.images.layers import LayeredPicture, frame_of
+from mistyle.io.images.quantisation import fractions
 from mistyle.io.images.read import picture_of
 from mistyle.io.sandbox.reader_process import ask
 
@@ -35,6 +36,7 @@ __all__ = [
     "read_radiance",
     "read_raw",
     "read_size",
+    "read_stored_pixels",
     "read_stored_size",
     "read_toml",
     "read_yaml",
@@ -101,6 +103,12 @@ def read_npy(path: Path) -> np.ndarray:
 def read_picture(path: Path, pixels: Pixels = "upright") -> Picture:
     """A style or any other picture file as sRGB-encoded float32 0..1; see io/images/read.py."""
     return picture_of(Path(path), ask("picture", Path(path), pixels))
+
+
+def read_stored_pixels(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, Float[np.ndarray, "h w"] | None]:
+    """The colours of `read_picture` as 8- or 16-bit integers (floats where the file has them), and its alpha."""
+    rgb, alpha, _ = ask("picture", Path(path), pixels)
+    return rgb, None if alpha is None else fractions(alpha)
 
 
 def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:

@@ -89,13 +89,18 @@ def _raw(path: Path, max_faces: int) -> Raw:
 
 
 def read_extent(
-    path: Path, *, uv: Literal["keep", "new", "auto"] = "auto", max_faces: int = 5_000_000, size: int = 2048
+    path: Path,
+    *,
+    uv: Literal["keep", "new", "auto"] = "auto",
+    up: Literal["y", "z"] = "y",
+    max_faces: int = 5_000_000,
+    size: int = 2048,
 ) -> Extent:
     """The size of `read_mesh`'s asset: its faces, texture sets and own maps; nothing is unwrapped."""
     from mistyle.io.meshes.prepare import extent
 
     path = Path(path)
-    return extent(_raw(path, max_faces), path, uv, size)
+    return extent(_raw(path, max_faces), path, uv, up, size)
 
 
 def read_usd_files(path: Path) -> list[Path]:

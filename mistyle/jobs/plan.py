@@ -26,7 +26,7 @@ PER_CROP_PIXEL = 1.6e-6
 PER_VGG_PIXEL = 3.4e-6  # of a crop in a step of the finish: twice forward, once back, to relu3_1
 PER_PAINTING = 2.0  # the painting's own features, once
 # Fits to pictures:
-PER_READ_PIXEL = 8e-7  # a pixel read and undistorted
+PER_READ_PIXEL, PER_BENT_PIXEL = 1.2e-7, 3e-7  # a pixel read, and made straight
 
 PER_TABLE_PIXEL = 4e-8  # of all views, for each texture set that is baked
 
@@ -38,15 +38,18 @@ def extent_of(mesh: Path, settings: Any) -> Extent:
     """The size of a mesh file's asset; the file is read, but nothing is unwrapped."""
     files = input_files(mesh)
     stamps = tuple((str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files)
-    return _extent(mesh, settings.read.uv, settings.read.max_faces, settings.atlas.size, stamps)
+    read = settings.read
+    return _extent(mesh, read.uv, read.up, read.max_faces, settings.atlas.size, stamps)
 
 
 @lru_cache(maxsize=64)  # a batch names few meshes many times
-def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size: int, stamps: object) -> Extent:
+def _extent(
+    mesh: Path, uv: Literal["keep", "new", "auto"], up: Literal["y", "z"], max_faces: int, size: int, stamps: object
+) -> Extent:
     """`stamps` makes a changed file a new key of the cache."""
     from mistyle.io.read_mesh import read_extent
 
-    return read_extent(mesh, uv=uv, max_faces=max_faces, size=size)
+    return read_extent(mesh, uv=uv, up=up, max_faces=max_faces, size=size)
 
 
 def reading(extent: Extent) -> float:

@@ -70,13 +70,14 @@ def grouped(notes: Iterable[tuple[str, str]]) -> list[str]:
 
 
 class Remaining:
-    """Estimates the seconds left from completed shares: the time of the share done so far, carried on.
+    """Estimates the whole seconds left from completed shares: the time of the share done so far, carried on.
 
     Shares are proportional to planned seconds where a stage knows them. An estimate exceeds the previous one by
-    GROWTH at most, so that one slow step does not make the end seem far.
+    GROWTH at most, so that one slow step does not make the end seem far. LEAST is the least number of whole seconds
+    that can grow so.
     """
 
-    GROWTH = 1.25
+    GROWTH, LEAST = 1.25, 4
 
     def __init__(self) -> None:
         self._begin, self._last, self._end = (time.perf_counter(), 0.0), float("inf"), float("inf")
@@ -94,9 +95,9 @@ class Remaining:
         start, first = self._begin
         if not first < done < 1:
             return None
-        left = (time.perf_counter() - start) / (done - first) * (1 - done)
-        self._last = min(left, self.GROWTH * self._last, max(self._end - time.perf_counter(), 0.0))
-        return self._last
+        left = max(round((time.perf_counter() - start) / (done - first) * (1 - done)), self.LEAST)
+        self._last = min(left, self.GROWTH * self._last) // 1
+        return min(self._last, max(self._end - time.perf_counter(), 0.0))
 
 
 class StageReport:

@@ -18,23 +18,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps, Texels
-from mistyle.core.mesh import Mesh
+from mistyle.core.mesh import Mesh, surface_of
 from mistyle.core.stage_progress import StageProgress
 from mistyle.process import memory, stopping
-from mistyle.render.deferred.image_samples import window
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
 from mistyle.render.mitsuba.device import give_back
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.joint.gauss_newton import JointSetup, joint_pass, joint_setup, where_possible
+from mistyle.solver.joint.gauss_newton import TOO_LARGE, JointSetup, joint_pass, joint_setup
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pass_state import PassState, arrays_of, state_from
 from mistyle.solver.pictures.descend import picture_pass, settled
-from mistyle.solver.schedule import FILLED, Pass, Size, schedule, shares, size_from
-from mistyle.solver.settings import RecoverSettings, descent_steps
+from mistyle.solver.schedule import Pass, Size, runnable, schedule, shares, size_from
+from mistyle.solver.settings import RecoverSettings, descent_steps, joint_steps
 from mistyle.solver.smoothing import map_smoothing
 from mistyle.solver.table import atlas_of, linked
 from mistyle.solver.texels.detail import Detail
@@ -48,6 +46,7 @@ from mistyle.solver.texels.solve import (
     texel_level,
 )
 from mistyle.solver.validate import validate_captures
+from mistyle.solver.visible import visible_shares
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
@@ -77,7 +76,8 @@ class Recovered:
     seen        number of pictures that observed the texel in the light
     views       number of different cameras that did
     trace       values per round and step, by name
-    residuals   per picture by its name: root mean square of reference - render, relative to the reference's
+    residuals   per picture by its name: root mean square of reference - render, relative to the reference's; none
+                where `Limits` leave them out
     notes       sentences for the report
     passes      number of passes, and how many were `planned`
     """
@@ -119,12 +119,14 @@ class Reached:
 @dataclass(frozen=True)
 class Limits:
     """When a recovery ends: after so many `passes`, 0 for all, or with the first pass that would exceed `deadline`, a
-    value of `time.monotonic`. `watch` is called after each pass, `resumed` with the share that a checkpoint holds."""
+    value of `time.monotonic`. `watch` is called after each pass, `resumed` with the share that a checkpoint holds.
+    Without `judged` the pictures' residuals are left out, for whoever measures the maps himself."""
 
     passes: int = 0
     deadline: float = float("inf")
     watch: Callable[[Reached], None] = lambda reached: None
     resumed: Callable[[float], None] = lambda share: None
+    judged: bool = True
 
 
 NO_LIMITS = Limits()
@@ -153,7 +155,10 @@ def recover(
     from mistyle.render.mitsuba.draw import tracer
 
     notes: list[str] = []
-    settings = where_possible(settings, captures, sum(t.covered.size for t in texels), notes)
+    soft, wanted = has_soft(captures.lights), joint_steps(settings)
+    settings = runnable(settings, soft, sum(t.covered.size for t in texels))
+    if wanted and not soft and not settings.joint:
+        notes.append(TOO_LARGE.format(settings.memory))
     usable, traced = validate_captures(mesh, captures, notes), tracer(mesh)
     # The steps on whole pictures have no neighbours.
     grid = atlas_of(texels) if settings.solver == "pictures" else linked(mesh, texels)
@@ -169,13 +174,8 @@ def recover(
         work = _Work(context, start, journal, StageProgress(report))
         state, planned = work.run(limits)
         table, estimate = work.result(state)
-        renderer = work.renderer(state)
-        uploaded = renderer.upload(table)
-        residuals = {
-            camera.name: _residual(state.direct, renderer.image_and_coverage(uploaded, k), k)
-            for k, camera in enumerate(usable.cameras)
-        }
-    del renderer, uploaded, work
+        residuals = work.residuals(state, table) if limits.judged else {}
+    del work
     give_back()
     progress(1.0)
     return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
@@ -236,6 +236,15 @@ class _Work:
         """The final table of a state, smoothed and with its detail, and the texels' estimate."""
         table, estimate = self.smoothed(state)
         return self.detailed(state, table), estimate
+
+    def residuals(self, state: PassState, table: MaterialTable) -> dict[str, float]:
+        """The relative residual of every picture, by its name."""
+        renderer, direct = self.renderer(state), state.direct
+        uploaded = renderer.upload(table)
+        return {
+            camera.name: _residual(direct, renderer.image_and_coverage(uploaded, k), k)
+            for k, camera in enumerate(direct.captures.cameras)
+        }
 
     def detailed(self, state: PassState, table: MaterialTable) -> MaterialTable:
         """The table with the albedo's detail, where the texels were solved on a coarser level."""
@@ -344,14 +353,9 @@ def size_of(context: FitContext) -> Size:
     settings, cameras = context.settings, context.captures.cameras
     covered, soft = sum(int(c.sum()) for c in context.atlas.covered), has_soft(context.captures.lights)
     pixels = [camera.size[0] * camera.size[1] for camera in cameras]
-    return size_from(settings, pixels, covered, soft, shown_in(context.traced.mesh, cameras))
-
-
-def shown_in(mesh: Mesh, cameras: Sequence[Camera]) -> float:
-    """Approximate share of the pictures that shows the mesh: FILLED of its bounding boxes."""
-    boxes = [window(mesh, camera) for camera in cameras]
-    box = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in boxes)
-    return FILLED * box / sum(camera.size[0] * camera.size[1] for camera in cameras)
+    mesh = context.traced.mesh
+    visible = visible_shares(surface_of(mesh.positions, mesh.faces), cameras, context.captures.lights)
+    return size_from(settings, pixels, covered, soft, visible)
 
 
 def polished(context: FitContext, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable:

@@ -10,6 +10,7 @@ FEWER = 8  # factor of fewer samples for provisional estimates of indirect light
 PASSES = 8  # most passes over the pictures, the last twice as long
 DETAILED = 20_000_000  # most texels times pictures that are observed at once for the albedo's detail
 LEAST_MEASURED = 4
+LARGE = 4_000_000  # pixels of a picture from which it is averaged for a coarser level of the per-texel solver
 SWEEPS = 2  # least epochs of a pass; fewer steps give fewer passes
 
 
@@ -165,14 +166,11 @@ class RecoverSettings(BaseModel):
         return value
 
 
-def under_soft_light(settings: RecoverSettings) -> RecoverSettings:
-    """The settings under soft light: without joint steps, which would be slow, and within `soft_bounces`."""
-    return settings.model_copy(update={"joint": 0, "bounces": min(settings.bounces, settings.soft_bounces)})
-
-
-def measured_subsamples(settings: RecoverSettings, soft: bool) -> int:
-    """Samples a pixel of the pictures that measure a fit: at least LEAST_MEASURED, so that edges are averaged."""
-    return max(settings.soft_subsamples, LEAST_MEASURED) if soft else settings.subsamples
+def measured_subsamples(settings: RecoverSettings, soft: bool, pixels: float = 0) -> int:
+    """Samples a pixel of the pictures that measure a fit: at least LEAST_MEASURED, so that edges are averaged, and no
+    more in pictures of more than LARGE pixels."""
+    least = min(settings.subsamples, LEAST_MEASURED) if pixels > LARGE else settings.subsamples
+    return max(settings.soft_subsamples, LEAST_MEASURED) if soft else least
 
 
 def descent_steps(settings: RecoverSettings) -> int:

@@ -1,7 +1,5 @@
 """The joint steps at the end of a recovery: their algebra against dense matrices, their model against real pictures."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
@@ -10,7 +8,6 @@ from test_recover_smooth import atlas
 
 from mistyle.core.capture import subset
 from mistyle.core.image import gaussian
-from mistyle.core.light import Ambient
 from mistyle.render.deferred import image_samples as collecting
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer
@@ -21,6 +18,7 @@ from mistyle.solver.joint import gauss_newton as joint
 from mistyle.solver.joint.pixels import UnknownTexels, image_footprints
 from mistyle.solver.prior import NOTHING
 from mistyle.solver.recover import recover
+from mistyle.solver.schedule import runnable
 from mistyle.solver.table import linked
 
 FEW = QUICK.model_copy(update={"iterations": 60, "rounds": 1})
@@ -225,13 +223,8 @@ def test_steps_that_help_not_or_need_too_much_are_left_out(world, monkeypatch): 
     assert same(without, undone) and any("joint steps were undone" in n for n in undone.notes)
 
 
-def test_where_there_are_none(world):  # noqa: F811
-    _, _, _, captures = world
-    notes: list[str] = []
-    assert joint.where_possible(QUICK, captures, 1000, notes).joint == 3
-    soft = replace(captures, lights=((Ambient((1.0, 1.0, 1.0)),), *captures.lights[1:]))
-    assert joint.where_possible(QUICK, soft, 1000, notes).joint == 0
+def test_where_there_are_none():
+    assert runnable(QUICK, False, 1000).joint == 3 and runnable(QUICK, True, 1000).joint == 0
     for changed in ({"solver": "texels"}, {"solver": "pictures"}, {"smooth": False}):
-        assert joint.where_possible(QUICK.model_copy(update=changed), captures, 1000, notes).joint == 0
-    assert not notes
-    assert joint.where_possible(QUICK, captures, 4096**2, notes).joint == 0 and "atlas" in notes[0]
+        assert runnable(QUICK.model_copy(update=changed), False, 1000).joint == 0
+    assert runnable(QUICK, False, 4096**2).joint == 0 == runnable(QUICK, False, 1000, pixels=1e9).joint

@@ -6,8 +6,8 @@ from typing import Any
 from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
 from mistyle.process import memory
-from mistyle.solver.schedule import COVERED, LARGE, SEEN, SHOWN, solver_level
-from mistyle.solver.settings import DETAILED, joint_steps
+from mistyle.solver.schedule import COVERED, SEEN, SHOWN, solver_level
+from mistyle.solver.settings import DETAILED, LARGE, joint_steps
 
 # A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not
 # regain completely after the stage. Measured by `fit_512` and `fit_200` of `python -m benchmarks.photographs`, the

@@ -34,13 +34,15 @@ def write(
 def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:
     """Write a Mitsuba scene of the result that renders without mistyle."""
     from mistyle.atlas.frames import mitsuba_normals
-    from mistyle.atlas.texels import pad, pad_maps
+    from mistyle.atlas.texels import pad_in_place, pad_maps
     from mistyle.render.mitsuba.scene_folder import write_scene
 
     padding, turned = job.settings.atlas.padding, list(recovered.maps)
     if job.settings.recover.frame == "mikkt":
         # Texels outside the islands have no tangent frame.
-        normals = [pad(mitsuba_normals(asset.mesh, m, t), t, padding) for m, t in zip(turned, texels, strict=True)]
-        turned = [replace(m, normal=normal) for m, normal in zip(turned, normals, strict=True)]
+        for k, (m, t) in enumerate(zip(recovered.maps, texels, strict=True)):
+            turned[k] = replace(m, normal=mitsuba_normals(asset.mesh, m, t))
+            pad_in_place([turned[k].normal], t, padding)
     padded = [pad_maps(m, t, padding, own=BORDER) for m, t in zip(turned, texels, strict=True)]
+    del turned
     write_scene(folder, job.name, asset.mesh, padded, captures.cameras, captures.lights[0])

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, subset
+from mistyle.core.capture import Captures, Loaded, in_memory, shrunk, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
@@ -27,6 +27,7 @@ from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
 from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
+from mistyle.fitting.pipeline.times import running
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs.edits import asset_stage, tell_edits
@@ -39,6 +40,7 @@ from mistyle.process import memory
 from mistyle.solver.photometry.record import Photometry
 from mistyle.solver.settings import measured_subsamples
 
+PICTURED = 1600  # pixels along the longer side of the pictures that the report shows, at most
 TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
 
 
@@ -102,17 +104,18 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     claim_run(job, MATERIAL_STAGES, inputs_of(job))
     check(s)
     captures = references_of(job)
-    check_material(s, pixels_of(captures))
+    needed = running(s, has_soft(captures.lights) or job.lights == "unknown", s.atlas.size**2)
+    check_material(needed, pixels_of(captures))
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
     captures = in_working_space(captures, shots, s.colour)
     pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
-    files_at = job.out / "work" if in_files(s, pixels_of(captures)) else None
+    files_at = job.out / "work" if in_files(needed, pixels_of(captures)) else None
     with Run(job, progress, MATERIAL_STAGES) as run, memory.within(1e9 * allowed(s).gb, files_at):
         start_engines(s)
         asset = run.record(
             "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
         )
-        check_material(s, pixels_of(captures), *size_of(asset))
+        check_material(needed, pixels_of(captures), *size_of(asset))
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
         read_as = [shot.pixels for shot in shots]
         key_inputs = [pictures, read_as, [vars(c) for c in captures.cameras], captures.lights]
@@ -355,7 +358,7 @@ def measure(
         else:
             errors.append(float("nan"))
         if k in shown_pictures:
-            shown[k] = (np.where(valid[..., None], rgb, 0).astype(np.float32), rendered[0][0])
+            shown[k] = _small(captures.cameras[k], (rgb, valid), rendered[0][0])
             scale = float(rendered[0][0][valid].mean()) if valid.any() else 0.0
             if scale > 0:
                 converted.append(float(np.abs(rendered[1][0] - rendered[0][0])[valid].mean()) / scale)
@@ -369,11 +372,20 @@ def measure(
     )
 
 
+def _small(camera: Camera, reference: Loaded, predicted: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """A reference, 0 at its invalid pixels, and its prediction, both averaged to at most PICTURED pixels a side."""
+    pair = in_memory([camera] * 2, [()] * 2, [reference[0], predicted], [reference[1]] * 2)
+    pair = shrunk(pair, [-(-max(camera.size) // PICTURED)] * 2)
+    (rgb, valid), (drawn, _) = pair.load(0), pair.load(1)
+    return np.where(valid[..., None], rgb, 0).astype(np.float32), drawn
+
+
 def renderer_of(traced: Any, captures: Captures, sizes: Any, chosen: Any, memory: float) -> Any:
     """The renderer of the one picture of `captures`; it keeps at most `memory` bytes of the picture's samples."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
-    subsamples = measured_subsamples(chosen, has_soft(captures.lights))
+    height, width = captures.cameras[0].size
+    subsamples = measured_subsamples(chosen, has_soft(captures.lights), height * width)
     options = RenderOptions(
         chosen.model, chosen.frame, subsamples, memory=memory, directions=chosen.soft_measured, gradients=False
     )

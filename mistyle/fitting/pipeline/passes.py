@@ -16,6 +16,7 @@ from mistyle.core.capture import Captures
 from mistyle.core.errors import Stopped
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Texels
+from mistyle.core.mesh import surface_of
 from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import write
 from mistyle.fitting.pipeline.times import closing_seconds
@@ -26,6 +27,7 @@ from mistyle.jobs.memory_budget import size_of, with_setting
 from mistyle.jobs.progress import StageReport
 from mistyle.jobs.run_record import merged_peaks, merged_seconds, write_record
 from mistyle.jobs.stages import Run
+from mistyle.solver.visible import visible_shares
 
 OFTEN = 2.0  # factor of the time since the start between two assets
 
@@ -51,7 +53,7 @@ def recovered_maps(run: Run, asset: Asset, texels: Sequence[Texels], captures: C
 def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, key: str, report: StageReport) -> Any:
     """The fit, with checkpoints in work/ under `key`, so that another job's checkpoint is never resumed."""
     from mistyle.atlas.texels import start_maps
-    from mistyle.solver.recover import Checkpoints, Limits, Reached, recover, shown_in
+    from mistyle.solver.recover import Checkpoints, Limits, Reached, recover
 
     job, s = run.job, run.job.settings
     start = None
@@ -73,13 +75,13 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         if reached.done < reached.planned and time.monotonic() - since >= OFTEN * (written[0] - since):
             write_reached(reached, smooth=True)
 
-    shown = shown_in(asset.mesh, captures.cameras)
-    closing = closing_seconds(s, pixels_of(captures), texels, has_soft(captures.lights), shown)
+    visible = visible_shares(surface_of(asset.mesh.positions, asset.mesh.faces), captures.cameras, captures.lights)
+    closing = closing_seconds(s, pixels_of(captures), texels, has_soft(captures.lights), visible)
     deadline = since + 60 * s.minutes - closing if s.minutes else float("inf")
     checkpoints = Checkpoints(
         lambda arrays: checkpoint.save(folder, arrays), checkpoint.load(folder, run.progress.note)
     )
-    limits = Limits(s.passes, deadline, watch, report.begin_at)
+    limits = Limits(s.passes, deadline, watch, report.begin_at, judged=False)
     report.end_in(deadline - time.monotonic())
     try:
         return recover(

@@ -1,8 +1,9 @@
 """Estimates of `--dry-run` for a fit to pictures; see jobs/plan.py."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
 from mistyle.fitting.pipeline.budget import (
     averaged_pixels,
@@ -14,10 +15,14 @@ from mistyle.fitting.pipeline.budget import (
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.fitting.pipeline.photometry import photometry_mode
-from mistyle.fitting.pipeline.times import FIRST_PICTURES, closing_stages, recover_seconds
+from mistyle.fitting.pipeline.times import FIRST_PICTURES, closing_stages, recover_seconds, running
+from mistyle.geometry.lens import is_pinhole
+from mistyle.geometry.similarity import moved, upright
+from mistyle.io.meshes.parsed_mesh import Extent
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
+    PER_BENT_PIXEL,
     PER_READ_PIXEL,
     PER_TEXEL,
     costs,
@@ -26,20 +31,25 @@ from mistyle.jobs.plan import (
 )
 from mistyle.jobs.settings import thread_count
 from mistyle.jobs.stages import claim_run
-from mistyle.solver.schedule import COVERED, FILLED, SHOWN
+from mistyle.solver.schedule import COVERED, FILLED, TYPICAL, Visible
 
-LIGHT_SECONDS = 12  # of an unknown light, of few observations whatever the pictures
-PER_ALIGNED = 0.1  # a picture that is placed, and its outline checked
-EXPLAINED_SECONDS = 20  # of exposures with a material
-PHOTOMETRY_SECONDS = 12  # the number of points is bounded
-READS = 1.5  # of every picture for each of both
+if TYPE_CHECKING:
+    from mistyle.io.cameras.captures import CapturedPicture
+
+STARTING = 1  # of the program
+ALIGNED = 1.5  # of a mesh that is aligned
+PER_OUTLINE = 0.003  # a picture that is placed, and its outline checked
+PER_MATCHED, PER_EXPLAINED = 0.15, 0.8  # a picture whose exposure is solved by points, and with a material
+# Of an unknown light; where exposures are solved, the mean of fits that they gave the light and of others.
+LIGHT_SECONDS, LEFT_LIGHT = 12, 4
+PER_FIRST_TEXEL, FIRST_TEXELS = 3e-6, 512**2  # a texel of the first asset, and most of them
 
 
 def plan_material(job: Any) -> dict[str, Any]:
     """The plan of a `MaterialJob`; cameras, lights and pictures' headers are read and refused as the job does.
 
-    The object's share of the pictures is still unknown: solver/schedule.py and fitting/pipeline/budget.py give typical
-    shares.
+    How much the pictures show of the mesh is measured, unless it must be aligned first: solver/schedule.py then gives
+    typical shares.
     """
     from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
     from mistyle.io.cameras.captures import read_shots
@@ -50,22 +60,24 @@ def plan_material(job: Any) -> dict[str, Any]:
     captures = references_of(job)
     sizes = pixels_of(captures)
     texels = extent.sets * s.atlas.size**2
-    chosen = check_material(s, sizes, *size)
+    covered = texels * (extent.covered if extent.covered > 0 else COVERED)
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
-    averaged, shown = averaged_pixels(s, sizes), SHOWN if masked(shots) else FILLED
-    unknown, reads = job.lights == "unknown", READS * sum(sizes) * PER_READ_PIXEL
-    matched = photometry_mode(job, shots) != "none"
+    averaged, visible = averaged_pixels(s, sizes), shares_of(job, (captures, shots), extent)
+    read = reading_seconds(shots, sizes)
+    unknown, matched = job.lights == "unknown", photometry_mode(job, shots) != "none"
     soft = unknown or has_soft(captures.lights)
+    s = running(s, soft, texels, visible.shown * sum(averaged))
+    chosen = check_material(s, sizes, *size)
     stages = {
-        "mesh": reading(extent),
+        "mesh": STARTING + reading(extent),
         "texels": texels * PER_TEXEL,
-        "cameras": 1 + PER_ALIGNED * len(sizes) + first_asset_seconds(sizes),
-        **({"photometry": PHOTOMETRY_SECONDS + reads} if matched else {}),
-        **({"exposures": EXPLAINED_SECONDS + unknown * LIGHT_SECONDS + reads} if matched else {}),
-        "pictures": sum(sizes) * PER_READ_PIXEL,
-        **({"light": 1 if matched else LIGHT_SECONDS} if unknown else {}),
-        "recover": recover_seconds(s, averaged, COVERED * texels, soft, shown),
-        **closing_stages(s, averaged, texels, soft, shown),
+        "cameras": cameras_seconds(job, shots, sizes) + first_asset_seconds(len(sizes), texels, read),
+        **({"photometry": 8 + PER_MATCHED * len(sizes) + read} if matched else {}),
+        **({"exposures": 7 + PER_EXPLAINED * len(sizes)} if matched else {}),
+        "pictures": read,
+        **({"light": LEFT_LIGHT if matched else LIGHT_SECONDS} if unknown else {}),
+        "recover": recover_seconds(s, averaged, covered, soft, visible),
+        **closing_stages(s, averaged, texels, soft, visible),
     }
     stored = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
     return {
@@ -81,14 +93,38 @@ def plan_material(job: Any) -> dict[str, Any]:
     }
 
 
-def first_asset_seconds(sizes: list[int]) -> float:
-    """Seconds of reading and projecting the few pictures of the first asset, of so many pixels each."""
-    return 1 + sum(sizes) * min(1, FIRST_PICTURES / len(sizes)) * PER_READ_PIXEL
+def first_asset_seconds(count: int, texels: float, read: float) -> float:
+    """Seconds of projecting few of `count` pictures, all of which take `read` seconds to be read."""
+    return 0.2 + min(1, FIRST_PICTURES / count) * read + min(texels, FIRST_TEXELS) * PER_FIRST_TEXEL
 
 
-def masked(shots: Sequence[Any]) -> bool:
-    """Whether a picture has a mask or alpha, so that the object is likely to fill less of it."""
-    return any(shot.mask is not None or shot.alpha_of is not None for shot in shots)
+def cameras_seconds(job: Any, shots: Sequence["CapturedPicture"], sizes: Sequence[int]) -> float:
+    """Seconds of placing the cameras: masks and alpha are read."""
+    masked = sum(n for n, shot in zip(sizes, shots, strict=True) if shot.mask is not None or shot.alpha_of is not None)
+    aligned = ALIGNED * (job.settings.references.align + job.settings.references.refine_poses * len(sizes))
+    return 0.1 + aligned + PER_OUTLINE * len(sizes) + masked * PER_READ_PIXEL
+
+
+def reading_seconds(shots: Sequence["CapturedPicture"], sizes: Sequence[int]) -> float:
+    """Seconds of reading every picture once, and of making it straight."""
+    bent = sum(n for n, shot in zip(sizes, shots, strict=True) if not is_pinhole(shot.lens))
+    return sum(sizes) * PER_READ_PIXEL + bent * PER_BENT_PIXEL
+
+
+def shares_of(job: Any, references: tuple[Captures, Sequence["CapturedPicture"]], extent: Extent) -> Visible:
+    """The shares of the mesh in the pictures. Typical ones where it must be aligned first: with masks or alpha the
+    object is likely to fill less of a picture."""
+    from mistyle.io.cameras.captures import camera_space
+    from mistyle.solver.visible import visible_shares
+
+    captures, shots = references
+    if not job.settings.references.align:
+        own = camera_space(job.references) == "own"
+        placed = upright(captures) if job.settings.references.up == "z" else captures
+        placed = moved(placed, extent.work_from_user) if own else placed
+        return visible_shares(extent.surface, placed.cameras, placed.lights)
+    masked = any(shot.mask is not None or shot.alpha_of is not None for shot in shots)
+    return TYPICAL if masked else Visible(FILLED, FILLED, FILLED)
 
 
 def _limited(settings: Any, stages: dict[str, float]) -> dict[str, float]:

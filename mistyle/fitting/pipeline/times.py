@@ -6,38 +6,44 @@ from typing import Any
 from mistyle.core.maps import Texels
 from mistyle.jobs.plan import PER_TEXEL
 from mistyle.jobs.settings import thread_count
-from mistyle.solver.schedule import COVERED, finishing_seconds, joint_bytes, picture_seconds, size_from, whole_seconds
-from mistyle.solver.settings import RecoverSettings, joint_steps, under_soft_light
+from mistyle.solver.schedule import Visible, finishing_seconds, picture_seconds, runnable, size_from, whole_seconds
 
 FIRST_PICTURES = 8  # most pictures of the first asset: large ones are slow to read
-PER_SCENE_TEXEL = 1.5e-6  # a texel written as EXR
-PER_REPORT_RAY = 3e-7  # a sample of the report's pictures
+PER_REPORT_RAY = 7e-8  # a sample of the report's pictures
+REPORTED, PER_SHOWN_PIXEL = 8, 4e-7  # pictures that the report shows beside their prediction, and a pixel of these
 
 
-def recover_seconds(settings: Any, pixels: Sequence[int], covered: float, soft: bool, shown: float) -> float:
-    """Seconds of the passes within `--passes`, and of what precedes and follows them."""
-    chosen: RecoverSettings = settings.recover
-    fits = joint_bytes(covered / COVERED, shown * sum(pixels)) < 1e9 * chosen.memory
-    joint = joint_steps(chosen) if fits else 0
-    chosen = under_soft_light(chosen) if soft else chosen.model_copy(update={"joint": joint})
-    return whole_seconds(chosen, size_from(chosen, pixels, covered, soft, shown), settings.passes or None)
+def running(settings: Any, soft: bool, texels: float, pixels: float = 0) -> Any:
+    """The settings of a job, with `recover` as it will run: see `runnable`."""
+    return settings.model_copy(update={"recover": runnable(settings.recover, soft, texels, pixels)})
 
 
-def closing_stages(settings: Any, pixels: Sequence[int], texels: float, soft: bool, shown: float) -> dict[str, float]:
+def recover_seconds(settings: Any, pixels: Sequence[int], covered: float, soft: bool, visible: Visible) -> float:
+    """Seconds of the passes of `running` settings within `--passes`, and of what precedes and follows them."""
+    size = size_from(settings.recover, pixels, covered, soft, visible)
+    return whole_seconds(settings.recover, size, settings.passes or None)
+
+
+def closing_stages(
+    settings: Any, pixels: Sequence[int], texels: float, soft: bool, visible: Visible
+) -> dict[str, float]:
     """Seconds of the stages after "recover"."""
     report, drawn = settings.report, {"none": 0.0, "page": 0.3, "full": 1.0}[settings.report.detail]
+    rays, largest = report.frames * report.resolution**2 * report.spp, max(pixels, default=0)
     return {
-        "measure": 1 + picture_seconds(settings.recover, pixels, soft, shown),
-        "asset": 1 + 4 * texels * PER_TEXEL,
-        "scene": 0.5 + texels * PER_SCENE_TEXEL,
-        "report": drawn * (2 + report.frames * report.resolution**2 * report.spp * PER_REPORT_RAY),
+        "measure": 0.2 + picture_seconds(settings.recover, pixels, soft, visible.shown),
+        "asset": 0.05 + 0.8 * texels * PER_TEXEL,
+        "scene": 0.05 + texels * PER_TEXEL,
+        "report": drawn * (1.2 + rays * PER_REPORT_RAY + 2 * texels * PER_TEXEL) + REPORTED * largest * PER_SHOWN_PIXEL,
     }
 
 
-def closing_seconds(settings: Any, pixels: Sequence[int], texels: Sequence[Texels], soft: bool, shown: float) -> float:
+def closing_seconds(
+    settings: Any, pixels: Sequence[int], texels: Sequence[Texels], soft: bool, visible: Visible
+) -> float:
     """Seconds between the last pass and the end of a job, on its own threads."""
     count = sum(t.covered.size for t in texels)
     covered = sum(int(t.covered.sum()) for t in texels)
-    finishing = finishing_seconds(settings.recover, size_from(settings.recover, pixels, covered, soft, shown))
-    total = finishing + sum(closing_stages(settings, pixels, count, soft, shown).values())
+    finishing = finishing_seconds(settings.recover, size_from(settings.recover, pixels, covered, soft, visible))
+    total = finishing + sum(closing_stages(settings, pixels, count, soft, visible).values())
     return total * 2 / thread_count(settings)

@@ -27,11 +27,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.asset import RAW, Picture, Pixels
+from mistyle.core.asset import RAW, Pixels
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.errors import InputRefused
-from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Lights, lights_of_views
 from mistyle.geometry.lens import Lens, pinhole, resample
 from mistyle.io.cameras.camera_files import PIXELS, SPACE, CameraFrame, ViewEntry, read_entries, read_frames
@@ -49,6 +48,7 @@ from mistyle.io.cameras.picture_files import (
 )
 from mistyle.io.cameras.sfm import is_sfm, read_sfm
 from mistyle.io.cameras.views import picture_of_view
+from mistyle.io.images.quantisation import fractions, linear_rows
 from mistyle.io.read import (
     read_colmap,
     read_colmap_points,
@@ -59,6 +59,7 @@ from mistyle.io.read import (
     read_radiance,
     read_raw,
     read_size,
+    read_stored_pixels,
     read_stored_size,
 )
 from mistyle.io.sandbox.bounds import inside, read_bytes, refuse
@@ -227,7 +228,8 @@ def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 
             rgb = rgb / np.maximum(alpha, 1e-6)[..., None]
     if shot.mask is not None:
         usable = usable & _inside(shot.mask, shot.pixels)
-    rgb = np.where(usable[..., None], rgb / np.float32(shot.factor), 0).astype(np.float32)
+    rgb = rgb if shot.factor == 1 else rgb / np.float32(shot.factor)
+    rgb = np.where(usable[..., None], rgb, np.float32(0)).astype(np.float32, copy=False)
     return resample(shot.lens, rgb, usable)
 
 
@@ -416,21 +418,32 @@ def _decoded(
         values = read_raw(shot.picture, shot.pixels)
         usable = np.asarray((values < 65535 * min(saturation, 1)).all(axis=-1))
         return values.astype(np.float32) / 65535, _alpha(shot), usable
-    picture = read_picture(shot.picture, shot.pixels)
-    alpha = _alpha(shot, picture)
-    return linear_from_srgb(picture.rgb), alpha, np.asarray((picture.rgb < saturation).all(axis=-1))
+    rgb, alpha = read_stored_pixels(shot.picture, shot.pixels)
+    if alpha is None and shot.alpha_of is not None:
+        alpha = read_exr(shot.alpha_of).get("A")
+    return linear_rows(rgb), alpha, _unsaturated(rgb, saturation)
 
 
-def _alpha(shot: CapturedPicture, decoded: Picture | None = None) -> Float[np.ndarray, "h w"] | None:
-    """The alpha of the picture (`decoded`, if available), or of the EXR that it replaces."""
+def _unsaturated(encoded: np.ndarray, saturation: float) -> Bool[np.ndarray, "h w"]:
+    """The pixels of which every channel, encoded in integers or 0..1, is below `saturation`."""
+    least = saturation
+    if encoded.dtype.kind == "u":  # the first integer that counts as saturated
+        values = fractions(np.arange(np.iinfo(encoded.dtype).max + 1, dtype=encoded.dtype))
+        least = int(np.searchsorted(values, np.float32(saturation)))
+    below = [encoded[..., c] < least for c in range(encoded.shape[-1])]
+    return np.asarray(np.logical_and.reduce(below))
+
+
+def _alpha(shot: CapturedPicture) -> Float[np.ndarray, "h w"] | None:
+    """The alpha of the picture, or of the EXR that it replaces."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")
     kind = shot.picture.suffix.lower()
     # JPEGs and RAW files have none, so they need not be decoded.
-    if decoded is not None or kind not in (".jpg", ".jpeg", *RAW):
-        picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded
-        if picture.alpha is not None:
-            return picture.alpha
+    if kind not in (".jpg", ".jpeg", *RAW):
+        alpha = read_stored_pixels(shot.picture, shot.pixels)[1]
+        if alpha is not None:
+            return alpha
     return None if shot.alpha_of is None else read_exr(shot.alpha_of).get("A")
 
 

@@ -32,7 +32,12 @@ def finished(
 
 
 def linear_rows(encoded: Shaped[np.ndarray, "h w *c"]) -> Float[np.ndarray, "h w *c"]:
-    """sRGB to linear by blocks of rows, to bound the temporary memory."""
+    """sRGB to linear: integers through a table, floats by blocks of rows, to bound the temporary memory."""
+    if encoded.dtype.kind == "u":
+        import cv2
+
+        table = linear_from_srgb(fractions(np.arange(np.iinfo(encoded.dtype).max + 1, dtype=encoded.dtype)))
+        return cv2.LUT(encoded, table).reshape(encoded.shape) if encoded.dtype == np.uint8 else table[encoded]
     result = np.empty(encoded.shape, np.float32)
     for start in range(0, len(encoded), 256):
         result[start : start + 256] = linear_from_srgb(fractions(encoded[start : start + 256]))

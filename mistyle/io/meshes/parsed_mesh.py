@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive, Shading
 from mistyle.core.errors import InputRefused
+from mistyle.core.mesh import SpreadPoints
 from mistyle.geometry.retexture import REPEAT, Wraps
 from mistyle.io.images.quantisation import Kind, finished
 from mistyle.io.sandbox.bounds import WORK_TEXTURE
@@ -113,12 +114,19 @@ class Raw:
 
 @dataclass(frozen=True)
 class Extent:
-    """The size of a file's asset: faces, faces to unwrap anew, texture sets, and bytes of its own maps as float32."""
+    """The size of a file's asset: faces, faces to unwrap anew, texture sets, and bytes of its own maps as float32.
+
+    covered  the share of its sets that kept UVs cover; NaN where all are unwrapped anew
+    surface  points of the mesh in working space, to which `work_from_user` takes the file's
+    """
 
     faces: int
-    unwrapped: int = 0
-    sets: int = 1
-    own: int = 0
+    unwrapped: int
+    sets: int
+    own: int
+    covered: float
+    surface: SpreadPoints
+    work_from_user: Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.asset import TURNED, Asset, Material, Source
 from mistyle.core.image import resize
-from mistyle.core.mesh import Mesh
+from mistyle.core.mesh import Mesh, surface_of
 from mistyle.core.names import distinct
 from mistyle.geometry.normals import area_vectors, crease_normals, same_points, usable_normals
 from mistyle.geometry.raster import fragments
@@ -48,17 +48,19 @@ class _Plan:
     carried: bool = True
 
 
-def extent(raw: Raw, path: Path, uv: UnwrapMode, size: int) -> Extent:
+def extent(raw: Raw, path: Path, uv: UnwrapMode, up: Literal["y", "z"], size: int) -> Extent:
     """The size of `prepare`'s result, without unwrapping; refuses the same files."""
     check_positions(raw.positions, path)
     raw = plain_lookups(raw)
     area = np.linalg.norm(area_vectors(raw.positions, raw.faces), axis=1)
-    points, unwrapped, sets, own = same_points(raw.positions), 0, 0, 0
+    points, unwrapped, sets, own, covered = same_points(raw.positions), 0, 0, 0, []
     for m, material in enumerate(raw.materials):
         plan = _plan(raw, m, points, area, uv, path, [])
         unwrapped += 0 if plan.layout is not None else len(_own(raw, plan.rows))
         tiles = [1001] if plan.layout is None else np.unique(plan.layout.tile).tolist()
         sets += len(tiles)
+        if plan.layout is not None:
+            covered += [min(1.0, float(np.abs(signed_areas(plan.layout.uvs)).sum()) / len(tiles))] * len(tiles)
         tinted = raw.colours is not None and not _one_colour(raw.colours[plan.rows])
         for maps in (material.load(tile)[0] for tile in tiles):
             sides = {name: _side(entry, raw, plan, size) for name, entry in maps.items()}
@@ -68,7 +70,11 @@ def extent(raw: Raw, path: Path, uv: UnwrapMode, size: int) -> Extent:
                 sides["opacity"] = _tinted_side(sides.get("opacity"), size)
             channels = {name: 1 if name in ("roughness", "metallic", "opacity") else 3 for name in sides}
             own += sum(4 * height * width * channels[name] for name, (height, width) in sides.items())
-    return Extent(len(raw.faces), unwrapped, sets, own)
+    work_from_user = _work_matrix(raw, area > 0, path, up)
+    work = raw.positions @ work_from_user[:3, :3].T + work_from_user[:3, 3]
+    surface = surface_of(work, raw.faces)
+    share = float(np.mean(covered)) if covered else float("nan")
+    return Extent(len(raw.faces), unwrapped, sets, own, share, surface, work_from_user)
 
 
 def _side(entry: RawMap, raw: Raw, plan: _Plan, size: int) -> tuple[int, int]:

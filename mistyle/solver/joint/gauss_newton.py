@@ -27,8 +27,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.capture import Captures
-from mistyle.core.light import has_soft
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
@@ -44,8 +42,7 @@ from mistyle.solver.joint.pixels import (
 from mistyle.solver.journal import Journal
 from mistyle.solver.pass_state import PassState
 from mistyle.solver.prior import MARGIN, NOTHING
-from mistyle.solver.schedule import Pass, joint_bytes
-from mistyle.solver.settings import RecoverSettings, joint_steps, under_soft_light
+from mistyle.solver.schedule import Pass
 from mistyle.solver.smoothing import LEAST, prior_precision_matrix
 from mistyle.solver.table import Atlas, with_seam_weights
 from mistyle.solver.texels.observations import observation_std
@@ -231,18 +228,6 @@ def _linearised(
         LinearisedImage(p.fetch, d, _weights(r, d, e), np.nan_to_num(r))
         for p, d, r, e in zip(problem.footprints, slopes, residuals, errors, strict=True)
     ]
-
-
-def where_possible(settings: RecoverSettings, captures: Captures, texels: int, notes: list[str]) -> RecoverSettings:
-    """The settings, with `joint` 0 where no joint steps are planned (`joint_steps`) or, with a note, where the atlas is
-    too large for `settings.memory`; and those of soft light."""
-    if has_soft(captures.lights):
-        return under_soft_light(settings)
-    some = joint_steps(settings)
-    if some and joint_bytes(texels) > 1e9 * settings.memory:
-        notes.append(TOO_LARGE.format(settings.memory))
-        some = 0
-    return settings.model_copy(update={"joint": some})
 
 
 def _residual_stds(problem: JointProblem) -> list[ResidualStd]:
