@@ -132,12 +132,16 @@ def misfit(solution: Solution, observed: TexelObservations, atlas: Atlas) -> Flo
 
 
 def observation_std(solution: Solution, observed: TexelObservations, atlas: Atlas) -> Values:
-    """Standard deviations of a texel's estimate, scaled by the local misfit. They shrink where observations fit far
-    better than `noise` and `relative` predict. NOTHING without observations."""
+    """Standard deviations of a texel's estimate, scaled by the local misfit. NOTHING without observations."""
+    return unconstrained_std(solution, observed, MARGIN * misfit_scale(solution, observed, atlas))
+
+
+def misfit_scale(solution: Solution, observed: TexelObservations, atlas: Atlas) -> Float[np.ndarray, " t"]:
+    """Factor of the observations' variance, from a texel's own misfit and that around it. It falls below 1 where
+    observations fit far better than `noise` and `relative` predict."""
     around = misfit(solution, observed, atlas)
     own = np.where(observed.seen >= OFTEN, solution.cost / np.maximum(observed.seen - len(UNKNOWNS) / 3, 1), 0)
-    scale = MARGIN * np.maximum(np.maximum(around, own) / 3, BEST_FIT)
-    return unconstrained_std(solution, observed, scale)
+    return np.maximum(np.maximum(around, own) / 3, BEST_FIT)
 
 
 def data_weight(solution: Solution, observed: TexelObservations) -> Float[np.ndarray, " t"]:

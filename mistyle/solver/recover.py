@@ -24,9 +24,10 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, surface_of
 from mistyle.core.stage_progress import StageProgress
 from mistyle.process import memory, stopping
-from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
+from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT, MaterialTable
 from mistyle.render.mitsuba.device import give_back
 from mistyle.solver.context import DirectCaptures, FitContext
+from mistyle.solver.deviation import class_std
 from mistyle.solver.joint.gauss_newton import TOO_LARGE, JointSetup, joint_pass, joint_setup
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pass_state import PassState, arrays_of, state_from
@@ -71,8 +72,9 @@ class Recovered:
     """The fitted maps and their uncertainty, per texture set.
 
     maps        `known` is True where at least one picture observed the texel in the light
-    confidence  0..1: 1 / (1 + mean of (standard deviation / HALF_SURE)²); 1 is certain, 0 unobserved
-    spread      standard deviations of albedo, normal (of the tilt: radians), roughness and metallic
+    confidence  0..1: 1 / (1 + mean of (standard deviation / HALF_SURE)²) for what a texel's own observations leave
+                open; 1 is certain, 0 unobserved
+    spread      standard deviations of albedo, normal (of the tilt: radians), roughness and metallic, see `deviation.py`
     seen        number of pictures that observed the texel in the light
     views       number of different cameras that did
     trace       values per round and step, by name
@@ -401,7 +403,13 @@ def _recovered(
         return tuple(values[part].reshape(size) for part, size in zip(grid.parts, grid.sizes, strict=True))
 
     seen = grids(estimate.seen.astype(np.int32))
-    spreads = {n: grids(np.sqrt(v).astype(np.float32)) for n, v in variance.items()}
+    stated = estimate.std
+    if estimate.solved:
+        moved = (table - estimate.table)[:, SOLVED] * (descent_steps(settings) > 0 and not settings.joint)
+        stated = np.sqrt(stated**2 + moved**2)
+        if settings.metallic:
+            stated[:, METALLIC] = class_std(table[:, METALLIC], estimate.std[:, METALLIC], estimate.seen > 0, grid)
+    spreads = {n: grids(np.sqrt((stated[:, c] ** 2).mean(axis=1))) for n, c in CHANNELS.items()}
     return Recovered(
         maps=_maps(context, estimate, table),
         confidence=grids(sure),

@@ -16,6 +16,7 @@ from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import METALLIC, SOLVED, MaterialTable
 from mistyle.solver import prior as recover_prior
 from mistyle.solver.context import DirectCaptures, FitContext, Radiance
+from mistyle.solver.deviation import open_std
 from mistyle.solver.journal import Journal
 from mistyle.solver.schedule import Pass, rounds_since, solver_level
 from mistyle.solver.table import PRIOR_MEAN, Atlas, Values, linked, scatter, scatter_to_atlas
@@ -40,7 +41,7 @@ INDIRECT_STD = 0.5  # standard deviation of an estimate of indirect light, relat
 class TexelEstimate:
     """The per-texel solver's result at the atlas's resolution; not `solved`: only the start.
 
-    std            standard deviations under observations and priors
+    std            standard deviations that a texel's own observations leave (`deviation.open_std`)
     data_weight    the data's share in a texel's tilt against its neighbours', 0..1
     unconstrained  standard deviations under the observations alone, `prior.NOTHING` without any
     seen, views    number of pictures and of cameras that observed each texel in the light
@@ -209,7 +210,8 @@ def estimate_of(level: TexelLevel, solution: Solution | None, context: FitContex
             note = f"{int(bad.sum())} texels were not finite after the per-texel solver and were reset."
             context.notes.extend([note] * (note not in context.notes))
         values = np.where(bad, mean, solution.values)
-        std = np.where(bad, std, solution.spread * recover_prior.inflation(solution, observed))
+        assert level.problem is not None
+        std = np.where(bad, std, open_std(level.problem, solution, observed, atlas, context.settings.joint > 0))
         weight = recover_prior.data_weight(solution, observed)
         unconstrained = recover_prior.observation_std(solution, observed, atlas)
         estimate = _on_atlas(observed, atlas, (values, std, weight, unconstrained), True)
