@@ -54,24 +54,24 @@ def moved_camera(camera: Camera, matrix: Float[np.ndarray, "4 4"]) -> Camera:
     return replace(camera, world_from_cam=pose)
 
 
-def moved_lights(rig: Lights, matrix: Float[np.ndarray, "4 4"]) -> Lights:
+def moved_lights(rig: Lights, matrix: Float[np.ndarray, "4 4"], environments: bool = True) -> Lights:
     """The lights of the moved world: the illumination of every surface stays the same.
 
     A point light's distances grow by the scale, so its intensity grows by the scale's square. An environment's map is
     resampled unless the motion only turns it about Y.
     """
-    return tuple(_moved(light, matrix) for light in rig)
+    still = () if environments else (Environment,)
+    return tuple(light if isinstance(light, still) else _moved(light, matrix) for light in rig)
 
 
 def moved(captures: Captures, work_from_cams: Float[np.ndarray, "4 4"], environments: bool = True) -> Captures:
-    """References with cameras and lights in another space; the pictures do not change, nor do `environments` if so
-    wished."""
-    kept = () if environments else (Environment,)
+    """References with cameras and lights in another space; the pictures do not change, nor do environments without
+    `environments`."""
     rig_cache: dict[int, Lights] = {}
     rigs = []
     for rig in captures.lights:
         if id(rig) not in rig_cache:
-            rig_cache[id(rig)] = tuple(x if isinstance(x, kept) else _moved(x, work_from_cams) for x in rig)
+            rig_cache[id(rig)] = moved_lights(rig, work_from_cams, environments)
         rigs.append(rig_cache[id(rig)])
     cameras = tuple(moved_camera(camera, work_from_cams) for camera in captures.cameras)
     return Captures(cameras, tuple(rigs), captures.load)
