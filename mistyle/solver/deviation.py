@@ -46,7 +46,7 @@ def open_std(problem: Problem, solution: Solution, observed: TexelObservations, 
     if not joint:
         variance[:, TILT] /= np.minimum(scale, 1)
     variance = np.minimum(variance, widest**2)
-    variance[observed.seen == 0] = widest**2
+    variance = np.where((observed.seen > 0)[:, None] & np.isfinite(variance), variance, widest**2)
     sure = 1 / variance[:, TILT]
     around = neighbourhood(sure, np.ones_like(sure), observed, atlas, BLUR, OVER_SEAMS[TILT])
     variance[:, TILT] = 1 / (sure + 1 / (1 / solution.prior[:, TILT] + 1 / around))
