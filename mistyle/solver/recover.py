@@ -27,7 +27,7 @@ from mistyle.process import memory, stopping
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT, MaterialTable
 from mistyle.render.mitsuba.device import give_back
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.deviation import class_std
+from mistyle.solver.deviation import class_std, shrunk_tilts
 from mistyle.solver.joint.gauss_newton import TOO_LARGE, JointSetup, joint_pass, joint_setup
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pass_state import PassState, arrays_of, state_from
@@ -35,7 +35,7 @@ from mistyle.solver.pictures.descend import picture_pass, settled
 from mistyle.solver.schedule import Pass, Size, runnable, schedule, shares, size_from
 from mistyle.solver.settings import RecoverSettings, descent_steps, joint_steps
 from mistyle.solver.smoothing import map_smoothing
-from mistyle.solver.table import atlas_of, linked
+from mistyle.solver.table import Values, atlas_of, linked
 from mistyle.solver.texels.detail import Detail
 from mistyle.solver.texels.solve import (
     TexelEstimate,
@@ -114,7 +114,7 @@ class Reached:
 
     def finished(self) -> tuple[Maps, ...]:
         """The maps of a recovery with as many passes: slower than `maps`."""
-        table, estimate = self.work.result(self.state)
+        table, estimate, _ = self.work.result(self.state)
         return _maps(self.work.context, estimate, table)
 
 
@@ -175,12 +175,12 @@ def recover(
     with stopping.at_checkpoints(PATIENCE):
         work = _Work(context, start, journal, StageProgress(report))
         state, planned = work.run(limits)
-        table, estimate = work.result(state)
+        table, estimate, stated = work.result(state)
         residuals = work.residuals(state, table) if limits.judged else {}
     del work
     give_back()
     progress(1.0)
-    return replace(_recovered(context, estimate, table, residuals), passes=state.done, planned=planned)
+    return replace(_recovered(context, (table, estimate, stated), residuals), passes=state.done, planned=planned)
 
 
 class _Work:
@@ -234,10 +234,14 @@ class _Work:
             journal.save()
         return state, len(planned)
 
-    def result(self, state: PassState) -> tuple[MaterialTable, TexelEstimate]:
-        """The final table of a state, smoothed and with its detail, and the texels' estimate."""
+    def result(self, state: PassState) -> tuple[MaterialTable, TexelEstimate, Values]:
+        """The final table of a state, smoothed and with its detail, the texels' estimate, and the table's standard
+        deviations."""
         table, estimate = self.smoothed(state)
-        return self.detailed(state, table), estimate
+        stated = _stated(self.context, estimate, table)
+        if estimate.solved and self.context.settings.smooth:
+            table = shrunk_tilts(table, stated, estimate.seen > 0, self.context.atlas)
+        return self.detailed(state, table), estimate, stated
 
     def residuals(self, state: PassState, table: MaterialTable) -> dict[str, float]:
         """The relative residual of every picture, by its name."""
@@ -390,10 +394,23 @@ def _residual(direct: DirectCaptures, drawn: tuple[np.ndarray, np.ndarray], k: i
     return float(np.sqrt((residual**2).sum() / max((reference**2).sum(), 1e-30)))
 
 
+def _stated(context: FitContext, estimate: TexelEstimate, table: MaterialTable) -> Values:
+    """Standard deviations of a table that follows from an estimate, see `deviation.py`."""
+    settings = context.settings
+    if not estimate.solved:
+        return estimate.std
+    moved = (table - estimate.table)[:, SOLVED] * (descent_steps(settings) > 0 and not settings.joint)
+    stated = np.sqrt(estimate.std**2 + moved**2)
+    if settings.metallic:
+        sure = estimate.std[:, METALLIC]
+        stated[:, METALLIC] = class_std(table[:, METALLIC], sure, estimate.seen > 0, context.atlas)
+    return stated
+
+
 def _recovered(
-    context: FitContext, estimate: TexelEstimate, table: MaterialTable, residuals: dict[str, float]
+    context: FitContext, found: tuple[MaterialTable, TexelEstimate, Values], residuals: dict[str, float]
 ) -> Recovered:
-    grid, settings = context.atlas, context.settings
+    grid, settings, (table, estimate, stated) = context.atlas, context.settings, found
     names = [n for n in CHANNELS if n != "metallic" or settings.metallic]
     variance = {n: (estimate.std[:, CHANNELS[n]] ** 2).mean(axis=1) for n in CHANNELS}
     doubt = np.mean([variance[n] / HALF_SURE[n] ** 2 for n in names], axis=0)
@@ -403,12 +420,6 @@ def _recovered(
         return tuple(values[part].reshape(size) for part, size in zip(grid.parts, grid.sizes, strict=True))
 
     seen = grids(estimate.seen.astype(np.int32))
-    stated = estimate.std
-    if estimate.solved:
-        moved = (table - estimate.table)[:, SOLVED] * (descent_steps(settings) > 0 and not settings.joint)
-        stated = np.sqrt(stated**2 + moved**2)
-        if settings.metallic:
-            stated[:, METALLIC] = class_std(table[:, METALLIC], estimate.std[:, METALLIC], estimate.seen > 0, grid)
     spreads = {n: grids(np.sqrt((stated[:, c] ** 2).mean(axis=1))) for n, c in CHANNELS.items()}
     return Recovered(
         maps=_maps(context, estimate, table),

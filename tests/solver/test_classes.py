@@ -76,14 +76,7 @@ def test_black_plastic_is_no_metal(share: float) -> None:
     assert wrong < (0.15 if share else 0.005), wrong
     apart = (found.maps[0].albedo - truth.albedo)[seen & ~metal]
     assert np.sqrt((apart**2).mean()) < (0.25 if share else 0.01)
-
-
-def test_stated_deviations_hold_two_thirds_of_the_errors() -> None:
-    """Metal without a highlight is uncertain, though its neighbours agree."""
-    noise = gaussian(np.random.default_rng(1).standard_normal((SIZE, SIZE)).astype(np.float32), 5.0)
-    truth = dark(noise > np.quantile(noise, 0.7))
-    found = recovered(truth)
-    seen = found.views[0] >= 3
     shares = calibration([truth], found.maps, found.spread, [seen.astype(float)])
-    print(shares)
-    assert shares["calibration_worst"] < 0.15
+    assert abs(shares["within_metallic"] - 0.683) < 0.1, shares
+    # Metal without a highlight is uncertain, though its neighbours agree.
+    assert shares["within_albedo"] > 0.58, shares
