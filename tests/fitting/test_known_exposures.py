@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import mistyle
 from benchmarks.captures_phone import Drawn, gains, photograph
 from benchmarks.recovery_pictures import Shot
 from mistyle.cli.main import main
+from mistyle.core.light import Lights
 from mistyle.fitting.pipeline.job import MaterialJob
 from mistyle.fitting.pipeline.photometry import photometry_mode
 from mistyle.fitting.settings.material import MaterialSettings, PhotometrySettings
@@ -33,11 +35,11 @@ def drawn(tmp_path_factory):
     folder = tmp_path_factory.mktemp("known")
     bowl(folder / "bowl.obj")
     cameras = [replace(c, name=f"{c.name}_{k}") for c in orbit(8, 0.55, SIDE) for k in range(2)]
-    rigs = [(replace(light, irradiance=(1.0, 1.0, 1.0)),) for _ in range(8) for light in KEYS]
+    rigs: list[Lights] = [(replace(light, irradiance=(1.0, 1.0, 1.0)),) for _ in range(8) for light in KEYS]
     views = photographed(read_mesh(folder / "bowl.obj", size=SIZE).mesh, cameras, rigs)
     pictures = [np.concatenate([view.rgb, view.coverage[..., None]], axis=-1) for view in views]
     shots = [Shot(camera, rig) for camera, rig in zip(cameras, rigs, strict=True)]
-    return Drawn(folder / "bowl.obj", None, shots, pictures)
+    return Drawn(folder / "bowl.obj", cast(Any, None), shots, pictures)
 
 
 def test_exposures_under_known_light_are_solved_and_said(drawn, tmp_path, capsys):

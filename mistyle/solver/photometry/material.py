@@ -65,7 +65,7 @@ LONGEST = 1.0  # largest change of a log gain in a step
 # Standard deviations of exposures, balances and vignetting around 0, and of those not solved for; INDEPENDENT is the
 # share of independent observations.
 EXPOSURE, BALANCE, FALL, FIXED = 1.0, 0.2, 0.5, 1e-4
-INDEPENDENT = 0.1
+INDEPENDENT = 0.02
 
 
 @dataclass(frozen=True)
