@@ -8,11 +8,9 @@ handedness. A map for Mitsuba alone is therefore converted texel by texel.
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.atlas.texels import bands
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.geometry.tangents import corner_tangents
-from mistyle.process import memory
 
 
 def mitsuba_normals(mesh: Mesh, maps: Maps, texels: Texels) -> Float[np.ndarray, "h w 3"]:
@@ -20,14 +18,14 @@ def mitsuba_normals(mesh: Mesh, maps: Maps, texels: Texels) -> Float[np.ndarray,
 
     Exact at texel centres; between them Mitsuba interpolates vectors that may belong to two faces' frames.
     """
-    tangents, result = corner_tangents(mesh), memory.copied(maps.normal)
-    for rows in bands(*texels.covered.shape):
-        at = texels.covered[rows]
-        place = texels.face[rows][at], texels.position[rows][at], texels.normal[rows][at]
-        ours, theirs = texel_frames(mesh, *place, tangents), texel_frames(mesh, *place, None)
-        world = np.einsum("tk,tkx->tx", maps.normal[rows][at], ours)
-        turned = np.einsum("tx,tkx->tk", world, theirs)
-        result[rows][at] = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-20)
+    at = texels.covered
+    place = texels.face[at], texels.position[at], texels.normal[at]
+    ours = texel_frames(mesh, *place, corner_tangents(mesh))
+    theirs = texel_frames(mesh, *place, None)
+    world = np.einsum("tk,tkx->tx", maps.normal[at], ours)
+    turned = np.einsum("tx,tkx->tk", world, theirs)
+    result = maps.normal.copy()
+    result[at] = turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-20)
     return result
 
 

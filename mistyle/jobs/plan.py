@@ -26,7 +26,7 @@ PER_CROP_PIXEL = 1.6e-6
 PER_VGG_PIXEL = 3.4e-6  # of a crop in a step of the finish: twice forward, once back, to relu3_1
 PER_PAINTING = 2.0  # the painting's own features, once
 # Fits to pictures:
-PER_READ_PIXEL, PER_BENT_PIXEL = 1.2e-7, 3e-7  # a pixel read, and made straight
+PER_READ_PIXEL, PER_BENT_PIXEL = 1e-7, 3e-7  # a pixel read, and made straight
 
 PER_TABLE_PIXEL = 4e-8  # of all views, for each texture set that is baked
 

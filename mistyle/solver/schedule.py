@@ -43,7 +43,7 @@ PER_OBSERVED = 4e-7  # a texel in a picture in a round, without the solver's ste
 PER_SEEN, PER_OPEN = 4.5e-7, 8e-7  # a pixel where texels are observed, and a texel and a cell, once
 PER_PICTURE, PER_SOFT_PICTURE = 5e-4, 0.008  # a picture, rendered
 PER_TRACED, PER_SOFT_TRACED = 0.01, 0.1  # a picture's kernels, recorded at its first rendering
-PER_LOADED = 1e-7  # a pixel of a picture, loaded and compared
+PER_LOADED = 7e-8  # a pixel of a picture, loaded and compared
 PER_SAMPLE, PER_SAMPLE_CELL = 4.5e-9, 1.5e-9  # a sample of a pixel, rendered
 PER_COLLECTED = 2e-7  # a sample of a pixel, collected once
 CACHED = 77  # bytes of a cached sample
@@ -52,7 +52,7 @@ PER_VISIBILITY = 1.3e-8  # a sample and a cell, once
 PER_PATH, PER_SOFT_PATH, PER_MISS = 1.3e-7, 3e-7, 5e-9  # a path of indirect light from the object, and from beside it
 SHARED = 0.7  # of a path's seconds, what pictures of one camera share
 PER_LIGHT_PICTURE, PER_LIGHT, PER_VECTOR = 0.01, 7e-7, 1.7e-6  # a picture and a pixel of such an estimate, smoothed
-PER_SMOOTHED = 8.5e-6  # a covered texel in one smoothing pass
+PER_SMOOTHED = 1.1e-5  # a covered texel in one smoothing pass
 # In a joint step: renderings of all pictures, a pixel of the object, and a texel. Its setup: a sample.
 JOINT_RENDERINGS, PER_JOINT, PER_JOINT_TEXEL, PER_JOINT_SAMPLE = 6, 4.4e-6, 1.8e-5, 1.9e-7
 PER_DETAIL = 4e-6  # a covered texel in a picture, for the albedo's detail

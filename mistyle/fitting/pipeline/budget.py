@@ -18,13 +18,14 @@ MATERIAL = {
     "pictures": Need(0.53, texel=71, photograph=97),
     "recover": Need(0.71, texel=640, look=9.6, picture=250, view=370),
     "measure": Need(0.73, texel=300, picture=330),
-    "asset": Need(0.76, texel=200, picture=200),
-    "scene": Need(0.76, texel=200, picture=200),
-    "report": Need(0.74, texel=200, drawn=70, frame=24, picture=200),
+    "asset": Need(0.76, texel=200, picture=60),
+    "scene": Need(0.76, texel=225, picture=60),
+    "report": Need(0.74, texel=200, drawn=70, frame=24, picture=60),
 }
 MATERIAL = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in MATERIAL.items()}
-# Bytes of a texel that lie in files where the budget is small.
-IN_FILES = {"pictures": 33, "recover": 150, "measure": 74, "asset": 74, "scene": 74, "report": 74}
+# Bytes of a texel that lie in files where the budget is small. Their pages stay in memory until it is needed: the
+# peak of a stage then lies between its need and the budget.
+IN_FILES = {"pictures": 33, "recover": 150, "measure": 74, "asset": 126, "scene": 138, "report": 94}
 KEEPING = ("recover", "measure", "asset", "scene", "report")
 SAMPLE = 32  # cached bytes per sample of a picture
 # The settings that save memory when halved.

@@ -336,6 +336,7 @@ def measure(
     from mistyle.core.image import srgb_from_linear
     from mistyle.measure.metrics import psnr
     from mistyle.render.deferred.material_table import pack
+    from mistyle.render.mitsuba.device import give_back
     from mistyle.render.mitsuba.draw import tracer
 
     chosen, sizes = settings.recover, [m.roughness.shape for m in maps]
@@ -354,7 +355,7 @@ def measure(
         rgb, valid = captures.load(k)
         valid = valid & (rendered[0][1] > 0.999)
         if valid.any():
-            errors.append(psnr(srgb_from_linear(rgb)[valid], srgb_from_linear(rendered[0][0])[valid]))
+            errors.append(psnr(srgb_from_linear(rgb[valid]), srgb_from_linear(rendered[0][0][valid])))
         else:
             errors.append(float("nan"))
         if k in shown_pictures:
@@ -362,7 +363,9 @@ def measure(
             scale = float(rendered[0][0][valid].mean()) if valid.any() else 0.0
             if scale > 0:
                 converted.append(float(np.abs(rendered[1][0] - rendered[0][0])[valid].mean()) / scale)
+        del first
         report((k + 1) / len(captures))
+    give_back()
     return Measured(
         names=tuple(camera.name for camera in captures.cameras),
         held=tuple(k in set(held) for k in range(len(captures))),
