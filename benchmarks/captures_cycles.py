@@ -12,9 +12,11 @@ them.
 `.normal_deg`, `.roughness_mse`, `.albedo_psnr`, `.metallic_right`: over the surface that three cameras see, against
 the file's own maps at the atlas's resolution (`.albedo_psnr_scaled`: after a factor per channel). `.relit_psnr`: Cycles
 draws the exported GLB and the original file under another sky; PSNR of the sRGB pictures (`_scaled`: after a factor per
-channel). `cycles.NAME.constant.…`: the best maps of one value each. `.seconds` of the fit.
+channel). `cycles.NAME.constant.…`: the best maps of one value each. `cycles.NAME.own.…`: the same fit to Mitsuba's
+pictures of the same files (glTF's reflectance, `path`), by the lamps: what is left is not Blender's. `.seconds` of the
+fit.
 
-Pictures have 256 pixels a side, 128 with --quick, which also takes 16 views and the preset `draft`.
+Pictures have 256 pixels a side, 128 with --quick, which also takes 16 views and fits texel by texel alone.
 """
 
 import os
@@ -22,7 +24,7 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +36,21 @@ from benchmarks.common import run_mistyle
 from benchmarks.material_metrics import align_channels, best_constant, map_errors, orb_mask, psnr_ldr
 from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, seen, truth
 from mistyle.core.maps import Maps
+from mistyle.geometry.similarity import moved, upright
+from mistyle.io.cameras.captures import read_captures
+from mistyle.io.images.write import write_exr
 from mistyle.io.read import read_exr, read_hdr
+from mistyle.io.read_mesh import read_mesh
 from mistyle.io.store.records import load_record
 from mistyle.render.external.blender import BLENDER, blender_command, find_blender
 from mistyle.render.external.render_files import run_job
+from mistyle.render.lookdev import scenes
 
 NAMES = ("avocado", "waterbottle", "suzanne")
 SKY, UNSEEN = "kiara_1_dawn_1k.hdr", "studio_small_03_1k.hdr"
 WORKER = str(Path(__file__).with_name("captures_cycles_worker.py"))
 WORDS = ("--set", "references.up=z", "--material", "gltf", "--metallic")
+QUICKLY = ("--preset", "draft", "--set", "recover.solver=texels", "--report", "none")
 LEAST_VIEWS = 3
 MEAN = 0.3  # mean radiance of the skies, so that few pixels of the 8-bit pictures are saturated
 
@@ -121,9 +129,10 @@ def asset(name: str, studio: Studio, quick: bool) -> dict[str, float]:
     figures = {f"cycles.{name}.blender_seconds": time.perf_counter() - start}
     sheet: dict[str, Maps] = {"truth": known.maps[0]}
     shown = {"truth": original}
-    draft = ["--preset", "draft", "--report", "none"] if quick else []
+    draft = QUICKLY if quick else []
     for kind, shots, words in (
         ("", lamps, draft),
+        (".own", drawn(studio, lamps), draft),
         ("_sky", sky, draft),
         ("_unknown", sky, ["--light", "unknown", *draft]),
     ):
@@ -132,8 +141,9 @@ def asset(name: str, studio: Studio, quick: bool) -> dict[str, float]:
         run_mistyle("fit", studio.model, shots, "-o", out, *WORDS, *words, "--atlas", len(known.texels[0].covered))
         figures[f"{label}.seconds"] = time.perf_counter() - start
         maps, weights = fitted(out, known)
+        figures |= errors(label, known, maps, weights)
         pictures = studio.relit(f"relit{kind}", next((out / "asset").glob("*.glb")))
-        figures |= errors(label, known, maps, weights) | relit_errors(label, original, pictures)
+        figures |= relit_errors(label, original, pictures)
         sheet[kind or "lamps"], shown[kind or "lamps"] = maps[0], pictures
         if not kind:
             constant = best_constant(known.maps, weights)
@@ -144,6 +154,24 @@ def asset(name: str, studio: Studio, quick: bool) -> dict[str, float]:
     report.map_sheet(studio.place / "maps.png", sheet, None, known.texels[0].covered)
     report.relit_sheet(studio.place / "relit.png", shown)
     return figures
+
+
+def drawn(studio: Studio, shots: Path) -> Path:
+    """A folder with Mitsuba's pictures of Blender's cameras and lamps."""
+    out, model = studio.place / "own", read_mesh(studio.model)
+    if (out / "lights.json").exists():
+        return out
+    out.mkdir(parents=True, exist_ok=True)
+    captures = moved(upright(read_captures(shots)), model.source.work_from_user)
+    black = (replace(m, shading=replace(m.shading, emission=(0.0, 0.0, 0.0))) for m in model.materials)
+    dark = replace(model, materials=tuple(black))
+    shapes = scenes.asset_shapes(dark)
+    for camera, lights in zip(captures.cameras, captures.lights, strict=True):
+        picture = scenes.drawn(scenes.asset_scene(shapes, camera, lights, "path"), 0, studio.size.samples, 1)
+        write_exr(out / f"{camera.name}.exr", {c: picture[..., k] for k, c in enumerate("RGBA")})
+    for name in ("transforms.json", "lights.json"):
+        shutil.copyfile(shots / name, out / name)
+    return out
 
 
 def fitted(out: Path, known: Truth) -> tuple[tuple[Maps, ...], list[np.ndarray]]:

@@ -186,6 +186,7 @@ def test_a_world_with_z_up_is_stood_up(cameras, rng):
     after = upright(before)
     sun, lamp, same = after.lights[0]
     assert after.lights[0] is after.lights[1] and same is sky
+    assert isinstance(sun, Directional) and isinstance(lamp, Point)
     assert sun.direction == pytest.approx((0, 1, 0)) and lamp.position == pytest.approx((1, 3, -2))
     assert lamp.intensity == pytest.approx((4, 4, 4))
     there = (px_from_world(c, np.array([[0.1, -0.2, 0.3]]))[0] for c in before.cameras)
