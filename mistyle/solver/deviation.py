@@ -13,17 +13,15 @@ ambiguous. (Off its highlight a smooth metal looks like a rough one of lower F0.
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.atlas.neighbours import within
 from mistyle.render.deferred.material_table import METALLIC, TILT
 from mistyle.solver.prior import BLUR, PRIOR_SPREAD, misfit_scale
-from mistyle.solver.table import OVER_SEAMS, Atlas, Values, diffused, fill, neighbourhood
+from mistyle.solver.table import OVER_SEAMS, Atlas, Values, diffused, neighbourhood
 from mistyle.solver.texels.levenberg_marquardt import Problem, Solution
 from mistyle.solver.texels.observations import TexelObservations
 
 BINARY = 0.5  # standard deviation of a metallic that is 0 or 1 with equal odds
 WITHIN = 0.683  # share of a normal distribution within its standard deviation
-AROUND = 24  # diffusion steps of the local variance of tilts, and of the distance of metallic from its class
-KNOWN = 0.02  # standard deviation of a tilt that limits its weight in the local variance
+AROUND = 24  # diffusion steps of the distance of metallic from its class
 
 
 def open_std(problem: Problem, solution: Solution, observed: TexelObservations, atlas: Atlas, joint: bool) -> Values:
@@ -51,22 +49,6 @@ def open_std(problem: Problem, solution: Solution, observed: TexelObservations, 
     around = neighbourhood(sure, np.ones_like(sure), observed, atlas, BLUR, OVER_SEAMS[TILT])
     variance[:, TILT] = 1 / (sure + 1 / (1 / solution.prior[:, TILT] + 1 / around))
     return np.sqrt(variance).astype(np.float32)
-
-
-def shrunk_tilts(
-    table: Float[np.ndarray, "a 8"], std: Values, known: Bool[np.ndarray, " a"], atlas: Atlas
-) -> Float[np.ndarray, "a 8"]:
-    """`table` with tilts multiplied by the share of their local variance that `std` does not explain (James and Stein,
-    1961), so that a flat normal map stays flat. Uncovered texels move as the nearest covered one."""
-    tilts, moved = table[:, TILT], np.zeros_like(table)
-    variance = std[:, TILT] ** 2
-    weight = np.where(known[:, None], 1 / (variance + KNOWN**2) ** 2, 0)
-    sums = np.concatenate([weight * tilts**2, weight * variance], axis=1)
-    for part, size, among in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
-        sums[part] = diffused(sums[part].reshape(1, *size, 4), within(among), AROUND).reshape(-1, 4)
-    share = np.clip(1 - sums[:, 2:] / np.maximum(sums[:, :2], 1e-12), 0, 1)
-    moved[:, TILT] = np.where(sums[:, :2] > 0, (share - 1) * tilts, 0)
-    return table + fill(moved, atlas)
 
 
 def class_std(

@@ -27,7 +27,7 @@ from mistyle.process import memory, stopping
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT, MaterialTable
 from mistyle.render.mitsuba.device import give_back
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.deviation import class_std, shrunk_tilts
+from mistyle.solver.deviation import class_std
 from mistyle.solver.joint.gauss_newton import TOO_LARGE, JointSetup, joint_pass, joint_setup
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pass_state import PassState, arrays_of, state_from
@@ -238,10 +238,7 @@ class _Work:
         """The final table of a state, smoothed and with its detail, the texels' estimate, and the table's standard
         deviations."""
         table, estimate = self.smoothed(state)
-        stated = _stated(self.context, estimate, table)
-        if estimate.solved and self.context.settings.smooth:
-            table = shrunk_tilts(table, stated, estimate.seen > 0, self.context.atlas)
-        return self.detailed(state, table), estimate, stated
+        return self.detailed(state, table), estimate, _stated(self.context, estimate, table)
 
     def residuals(self, state: PassState, table: MaterialTable) -> dict[str, float]:
         """The relative residual of every picture, by its name."""

@@ -404,7 +404,8 @@ def test_pictures_of_one_place_share_their_paths(monkeypatch):
 
 def test_with_light_between_surfaces_known_the_solver_begins_anew(world, monkeypatch):
     """Once before any estimate and after each among the rounds, always from the same start, and then with targets from
-    which the estimate is taken off, and not those that rounds have corrected."""
+    which the estimate is taken off, and not those that rounds have corrected. The last target is that of the stated
+    deviations."""
     from mistyle.solver.texels import rounds as recover_solve
     from mistyle.solver.texels import solve as recover_texels
     from mistyle.solver.texels.levenberg_marquardt import Problem
@@ -435,7 +436,7 @@ def test_with_light_between_surfaces_known_the_solver_begins_anew(world, monkeyp
     recover(mesh, [texels], some, settings, 0)
     begun = next(e for e in events if e[0] == "solve")
     one = ("target",)
-    assert events == [begun, one, ("estimate", 2), one, begun, one, ("estimate", 16), one, begun, one, one, one]
+    assert events == [begun, one, ("estimate", 2), one, begun, one, ("estimate", 16), one, begun, one, one, one, one]
     tangents = collecting.tangents_of(mesh, settings.frame)
     first = collect_observations(
         draw.tracer(mesh), [texels], some, tangents, ObservationOptions(facing=settings.facing)
