@@ -5,7 +5,7 @@ is (table, steps to the right, steps down), `terms` a `bsdf.terms` with its mode
 the delta lights and the soft light, or None.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,7 +38,7 @@ class BlockArrays:
     lights: tuple[Any, Any]
 
 
-def _fetch(textures: Any, samples: Samples, moved: tuple[Any, Any, Any] = (0, 0, 0)) -> list[Any]:
+def _fetch(textures: Any, samples: Samples, moved: Sequence[Any] = (0, 0, 0)) -> list[Any]:
     """Interpolated albedo 3, normal 3, roughness, metallic of each sample; `moved` is added to tilt and roughness."""
     import drjit as dr
     import mitsuba as mi
@@ -119,7 +119,7 @@ def slopes(terms, subsamples: int, textures, samples, pixels, lights) -> tuple[A
     for k in range(3):
         moved = [mi.Float(0), mi.Float(0), mi.Float(0)]
         dr.enable_grad(moved[k])
-        colour = _colour(terms, _fetch(textures, samples, tuple(moved)), samples, (lights[0], None))
+        colour = _colour(terms, _fetch(textures, samples, moved), samples, (lights[0], None))
         dr.forward(moved[k])
         results.append(dr.grad(colour))
     means = (_resolve(colour, pixels, subsamples) for colour in results)

@@ -195,8 +195,8 @@ def test_pictures_are_loaded_one_at_a_time(tmp_path, monkeypatch):
 
     nerf(tmp_path, [grey(0.1), grey(0.2), grey(0.3)])
     read: list[str] = []
-    real = module.read_picture
-    monkeypatch.setattr(module, "read_picture", lambda path, pixels: read.append(path.name) or real(path, pixels))
+    real = module.read_stored_pixels
+    monkeypatch.setattr(module, "read_stored_pixels", lambda path, pixels: read.append(path.name) or real(path, pixels))
     captures = read_captures(tmp_path)
     assert read == []
     captures.load(1), captures.load(1), captures.load(2)
