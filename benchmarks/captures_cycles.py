@@ -34,7 +34,7 @@ from benchmarks import recovery_pictures as drawing
 from benchmarks import recovery_report as report
 from benchmarks.common import run_mistyle
 from benchmarks.material_metrics import align_channels, best_constant, map_errors, orb_mask, psnr_ldr
-from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, seen, truth
+from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, observed_areas, seen, truth
 from mistyle.core.maps import Maps
 from mistyle.geometry.similarity import moved, upright
 from mistyle.io.cameras.captures import read_captures
@@ -51,7 +51,6 @@ SKY, UNSEEN = "kiara_1_dawn_1k.hdr", "studio_small_03_1k.hdr"
 WORKER = str(Path(__file__).with_name("captures_cycles_worker.py"))
 WORDS = ("--set", "references.up=z", "--material", "gltf", "--metallic")
 QUICKLY = ("--preset", "draft", "--set", "recover.solver=texels", "--report", "none")
-LEAST_VIEWS = 3
 MEAN = 0.3  # mean radiance of the skies, so that few pixels of the 8-bit pictures are saturated
 
 
@@ -179,8 +178,7 @@ def fitted(out: Path, known: Truth) -> tuple[tuple[Maps, ...], list[np.ndarray]]
     cameras = load_record(out / "work" / "cameras" / "record").cameras
     places = {tuple(np.round(camera.position, 4)): camera for camera in cameras}
     counts = seen(known, list(places.values()))
-    weights = [area * (count >= LEAST_VIEWS) for area, count in zip(known.areas, counts, strict=True)]
-    return load_record(out / "work" / "recover" / "record").maps, weights
+    return load_record(out / "work" / "recover" / "record").maps, observed_areas(known, counts)
 
 
 def errors(label: str, known: Truth, maps: Sequence[Maps], weights: Sequence[np.ndarray]) -> dict[str, float]:

@@ -38,7 +38,7 @@ from benchmarks import recovery_pictures as drawing
 from benchmarks.common import run_mistyle
 from benchmarks.material_metrics import align_channels, map_errors, orb_mask, psnr_ldr
 from benchmarks.recovery_pictures import Shot
-from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, seen, truth
+from benchmarks.recovery_truth import ASSETS, Truth, data_folder, find_asset, observed_areas, seen, truth
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, Environment, to_json
@@ -195,7 +195,7 @@ def fitted(place: Path, drawn: Drawn, done: Gains, words: Sequence[Any]) -> dict
         result["exposure_error"] = float(np.abs(np.expm1(solved - done.gain)).max())
     maps = load_record(place / "out" / "work" / "recover" / "record").maps
     counts = seen(known, list({s.camera.position.tobytes(): s.camera for s in drawn.shots}.values()))
-    weights = [area * (count >= 3) for area, count in zip(known.areas, counts, strict=True)]
+    weights = observed_areas(known, counts)
     errors = map_errors(known.maps, maps, weights)
     result |= {"normal": errors.normal_mean_deg, "roughness": errors.roughness_mse**0.5}
     result |= {"albedo": 10 ** (-errors.albedo_psnr / 20), "albedo_psnr_scaled": errors.albedo_psnr_aligned}

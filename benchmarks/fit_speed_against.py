@@ -30,7 +30,7 @@ from benchmarks import material_recovery
 from benchmarks import recovery_pictures as drawing
 from benchmarks.fit_speed_worker import NAMES, inputs_hash
 from benchmarks.look_paint import Tree, environment, this_tree, tree_at
-from benchmarks.recovery_truth import ASSETS, Truth, find_asset, seen, truth
+from benchmarks.recovery_truth import ASSETS, Truth, find_asset, observed_areas, seen, truth
 from mistyle.core.maps import Maps
 from mistyle.fitting.settings.material import MATERIAL_PRESETS
 
@@ -89,8 +89,7 @@ def case_of(name: str, quick: bool, scratch: Path) -> Case:
     shots = drawing.one_at_a_time(cameras)
     pictures = drawing.render(known.mesh, known.maps, shots, frame=options.frame, spp=options.spp, cache=options.cache)
     np.save(scratch / f"{name}.npy", np.stack(pictures))
-    counts = seen(known, cameras)
-    weights = [a * (n >= material_recovery.LEAST_VIEWS) for a, n in zip(known.areas, counts, strict=True)]
+    weights = observed_areas(known, seen(known, cameras))
     request = {"file": str(file), "name": name, "uv": uv, "resolution": side, "views": views}
     request["pictures"] = str(scratch / f"{name}.npy")
     return Case(name, known, material_recovery.Judge(known, weights, options), request)

@@ -34,12 +34,21 @@ from benchmarks.material_metrics import best_constant, calibration, confident, m
 from benchmarks.recovery_ours import ours
 from benchmarks.recovery_pictures import Shot
 from benchmarks.recovery_rivals import LOOPS, naive, write_job
-from benchmarks.recovery_truth import ASSETS, UV, Truth, data_folder, find_asset, seen, truth
+from benchmarks.recovery_truth import (
+    ASSETS,
+    LEAST_VIEWS,
+    UV,
+    Truth,
+    data_folder,
+    find_asset,
+    observed_areas,
+    seen,
+    truth,
+)
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.core.maps import Maps
 from mistyle.render.mitsuba.scene import Frame
 
-LEAST_VIEWS = 3
 RELIT_SPP = 128  # least samples of relit pictures: their own noise counts as an error of the maps
 KINDS = ("real", "strong", "paper", "soft", "own_soft", "unknown")
 RIVALS = ("together", *LOOPS)
@@ -179,7 +188,7 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
         known.mesh, known.maps, shots, frame=frame, spp=options.spp, depth=depth, cache=options.cache
     )
     counts = seen(known, cameras)
-    weights = [a * (n >= LEAST_VIEWS) for a, n in zip(known.areas, counts, strict=True)]
+    weights = observed_areas(known, counts)
     main_shots, main_pictures = drawing.together(shots, pictures) if row.kind == "paper" else (shots, pictures)
 
     judge = Judge(known, weights, options)

@@ -41,6 +41,7 @@ WAVES = 96
 TILT, TILT_LIMIT = 0.15, 0.6
 ROUGHNESS, ALBEDO = (0.15, 0.95), (0.1, 0.8)
 LEAST_COSINE = 0.1
+LEAST_VIEWS = 3
 LIFT = 1e-3
 
 
@@ -174,6 +175,11 @@ def _normal_cdf(x: np.ndarray) -> np.ndarray:
     from scipy.special import ndtr
 
     return ndtr(x)
+
+
+def observed_areas(truth: Truth, counts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The surface of the texels that at least LEAST_VIEWS cameras see, of `counts` from `seen`; 0 for the others."""
+    return [area * (count >= LEAST_VIEWS) for area, count in zip(truth.areas, counts, strict=True)]
 
 
 def seen(truth: Truth, cameras: Sequence[Camera]) -> tuple[np.ndarray, ...]:

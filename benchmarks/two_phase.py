@@ -25,7 +25,7 @@ from benchmarks import two_phase_struggle as struggle
 from benchmarks import two_phase_truth as known
 from benchmarks.common import finish, parser, timed
 from benchmarks.material_metrics import map_errors
-from benchmarks.recovery_truth import Truth, data_folder, seen
+from benchmarks.recovery_truth import Truth, data_folder, observed_areas, seen
 from benchmarks.two_phase_truth import Painted, silent
 from mistyle.core.camera import Camera
 from mistyle.core.capture import in_memory
@@ -45,7 +45,6 @@ from mistyle.stylization.settings import Settings
 
 KINDS = {"lit": "phase1", "soft": "paper"}
 DARK = 0.02  # linear albedo under which a logarithm says nothing of light
-LEAST_VIEWS = 3
 LAMP = Directional((0.87, -0.3, -0.39), (4.0, 4.0, 4.0), "camera")  # of the sheets: no light of the views
 
 
@@ -106,9 +105,9 @@ def prepare(mesh: Path, style: Path, settings: Settings, slope: float, spp: int,
     atlas = stylize_start.lay_out(asset, settings, silent)
     scene = known.painted(asset, read_picture(style), atlas, settings, slope, seed=0)
     cameras = known.cameras_of(settings.rig.resolution, 16)
-    count = seen(Truth("", asset.mesh, atlas.texels, scene.truth, scene.areas), cameras)
-    weights = tuple(area * (c >= LEAST_VIEWS) for area, c in zip(scene.areas, count, strict=True))
-    return Bench(scene, tuple(cameras), weights, count, settings, spp, cache)
+    truth = Truth("", asset.mesh, atlas.texels, scene.truth, scene.areas)
+    count = seen(truth, cameras)
+    return Bench(scene, tuple(cameras), tuple(observed_areas(truth, count)), count, settings, spp, cache)
 
 
 def measure(bench: Bench, kind: str) -> tuple[dict[str, Sequence[Maps]], dict[str, float]]:

@@ -30,6 +30,11 @@ def evenly(count: int, most: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
 
 
+def weighted_median(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> float:
+    """The lower weighted median of all values, of which there is one at least."""
+    return float(weighted_medians(np.zeros(len(values), np.int64), values, weight)[1][0])
+
+
 def weighted_medians(
     group: Int[np.ndarray, " n"], values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]
 ) -> tuple[Int[np.ndarray, " g"], Float[np.ndarray, " g"]]:

@@ -202,8 +202,8 @@ class _Work:
         context, journal = self.context, self.journal
         settings, pictures = context.settings, len(context.captures)
         state, solved = PassState(DirectCaptures(context.captures)), settings.solver != "pictures"
-        planned = schedule(settings, pictures, solved)
-        done = shares(settings, planned[: limits.passes or None], size_of(context))
+        planned, size = schedule(settings, pictures, solved), size_of(context)
+        done = shares(settings, planned[: limits.passes or None], size)
         if journal.resumed is not None:
             state = self._resumed(limits.passes or len(planned)) or state
         if state.done:
@@ -213,7 +213,7 @@ class _Work:
         elif state.estimate is not None:
             solved = state.estimate.solved
         planned = schedule(settings, pictures, solved)
-        done = shares(settings, planned[: limits.passes or None], size_of(context))
+        done = shares(settings, planned[: limits.passes or None], size)
         for k in range(state.done, min(limits.passes or len(planned), len(planned))):
             kinds = [one.kind for one in planned[k : k + 2]]
             state = self._prepared(state, planned[k])

@@ -232,10 +232,15 @@ def _per_sample(settings: RecoverSettings, size: Size) -> float:
     return PER_COLLECTED + settings.soft_cells * PER_VISIBILITY * (size.cells > 0)
 
 
+def _per_rendered(settings: RecoverSettings, size: Size) -> float:
+    """Seconds of rendering a collected sample."""
+    return PER_SAMPLE_CELL * (settings.soft_cells + 16) if size.cells else PER_SAMPLE
+
+
 def _rendering(settings: RecoverSettings, size: Size) -> float:
     """Seconds of rendering every picture from collected samples."""
     each = size.pictures * (PER_SOFT_PICTURE if size.cells else PER_PICTURE)
-    return each + size.samples * (PER_SAMPLE_CELL * (settings.soft_cells + 16) if size.cells else PER_SAMPLE)
+    return each + size.samples * _per_rendered(settings, size)
 
 
 def _collecting(settings: RecoverSettings, size: Size, samples: float) -> float:
@@ -250,9 +255,8 @@ def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     if one.kind in ("solve", "rounds"):
         total += _solving(settings, one, size)
     elif one.kind == "pictures":
-        sample = PER_SAMPLE_CELL * (settings.soft_cells + 16) if size.cells else PER_SAMPLE
-        again = _collecting(settings, size, size.samples)
-        step = PER_STEP + size.texels * PER_STEP_TEXEL + (GRADIENT * size.samples * sample + again) / size.pictures
+        rendered = GRADIENT * size.samples * _per_rendered(settings, size) + _collecting(settings, size, size.samples)
+        step = PER_STEP + size.texels * PER_STEP_TEXEL + rendered / size.pictures
         if size.cells:
             step += PER_SOFT_PICTURE
         total += one.steps * step + settings.smooth * size.texels * PER_SMOOTHED

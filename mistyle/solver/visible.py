@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from mistyle.core.camera import Camera, by_camera, px_from_world
 from mistyle.core.light import DELTA, Directional, Lights, direction_in_world, has_soft, position_in_world
 from mistyle.core.mesh import SpreadPoints
+from mistyle.core.rows import evenly
 from mistyle.solver.schedule import Visible
 
 CELLS, EACH = 48, 12  # most cells along the longer side of the box of the points; points of a cell, at least
@@ -22,9 +23,8 @@ BEHIND = 3.0  # depth, in widths of a cell, at which a point lies behind another
 
 def visible_shares(surface: SpreadPoints, cameras: Sequence[Camera], lights: Sequence[Lights]) -> Visible:
     """The shares for `cameras` and their `lights`; none or soft lights reach every point."""
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, PICTURES).round().astype(int))
     pixels, rows = [], []
-    for k in chosen:
+    for k in evenly(len(cameras), PICTURES):
         pixels.append(cameras[k].size[0] * cameras[k].size[1])
         rows.append(_shares(*surface, cameras[k], lights[k]))
     shown, seen, whole = np.array(rows)[:, :3].T

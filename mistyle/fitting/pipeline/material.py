@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, Loaded, in_memory, shrunk, subset
+from mistyle.core.capture import Captures, Loaded, in_memory, shrunk_to, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights, has_soft
 from mistyle.core.maps import Maps, Texels
@@ -378,8 +378,7 @@ def measure(
 def _small(camera: Camera, reference: Loaded, predicted: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
     """A reference, 0 at its invalid pixels, and its prediction, both averaged to at most PICTURED pixels a side."""
     pair = in_memory([camera] * 2, [()] * 2, [reference[0], predicted], [reference[1]] * 2)
-    pair = shrunk(pair, [-(-max(camera.size) // PICTURED)] * 2)
-    (rgb, valid), (drawn, _) = pair.load(0), pair.load(1)
+    (rgb, valid), (drawn, _) = map(shrunk_to(pair, PICTURED).load, (0, 1))
     return np.where(valid[..., None], rgb, 0).astype(np.float32), drawn
 
 

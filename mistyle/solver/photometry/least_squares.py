@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
+from mistyle.core.rows import weighted_median
+
 STEPS = 8  # reweighted solves
 HUBER = 1.5  # residuals beyond this many scales count linearly
 RIDGE = 1e-6  # relative to the mean diagonal; it decides directions that no observation measures
@@ -68,10 +70,3 @@ def solve(
     slopes = (groups.T @ (sparse.diags_array(robust * residual) @ columns)).toarray()
     inverse_normal = np.linalg.inv(normal)
     return LinearFit(x, inverse_normal @ (slopes.T @ slopes) @ inverse_normal, value, residual, scale)
-
-
-def weighted_median(values: Float[np.ndarray, " o"], weight: Float[np.ndarray, " o"]) -> float:
-    """The smallest value up to which the values have half of the weight."""
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weight[order])
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])

@@ -24,10 +24,11 @@ from scipy import sparse
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, shrunk_to
 from mistyle.core.light import has_soft
+from mistyle.core.rows import weighted_median, weighted_medians
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
 from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.solver.photometry.least_squares import one_hot, weighted_median
+from mistyle.solver.photometry.least_squares import one_hot
 from mistyle.solver.photometry.record import Gains, fall_terms
 from mistyle.solver.photometry.solve import positions
 from mistyle.solver.prior import log_prior_penalty, metal_f0_prior, penalty
@@ -253,8 +254,8 @@ def _fit_of(work: _Solve, gains: Gains, solution: Solution) -> MatchedMaterial:
     f, y = np.maximum(work.problem.predict(solution.values), LEAST), np.maximum(work.y, LEAST)
     weight, apart = y**2 / (y**2 + DARK**2), 1.4826 * np.abs(np.log(y / f))
     spreads, picture = np.zeros(len(gains.gain)), work.samples.observations.picture
-    for k in np.flatnonzero(work.samples.shown >= SHOWN):
-        spreads[k] = weighted_median(apart[picture == k].ravel(), weight[picture == k].ravel())
+    shown, medians = weighted_medians(np.repeat(picture, 3), apart.ravel(), weight.ravel())
+    spreads[shown] = np.where(work.samples.shown[shown] >= SHOWN, medians, 0)
     return MatchedMaterial(gains, work.cost(solution), weighted_median(apart.ravel(), weight.ravel()), spreads)
 
 
