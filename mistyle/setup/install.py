@@ -185,19 +185,21 @@ def install_torch(python: Path, venv: Path) -> None:
     for where, arguments in torch_ways(pin[1], nvidia(), sys.platform):
         say(f"installing torch {pin[1]} ({where})")
         if sys.platform == "linux" and "+cpu" not in arguments[-1]:
-            _check_room(venv, CUDA_DISK_BYTES, "the CUDA build of torch")
+            _check_room(venv, CUDA_DISK_BYTES, "the CUDA build of torch", failure)
         failure = pip(python, venv, "--no-deps", *arguments)
         if not failure:
             return
     raise SetupError(failure)
 
 
-def _check_room(venv: Path, needed: float, part: str) -> None:
+def _check_room(venv: Path, needed: float, part: str, before: str) -> None:
+    """Raise a SetupError that tells the room that is missing, after the reason why a smaller build was not taken."""
     free = shutil.disk_usage(venv).free
     if free < needed:
+        reason = f"{before}; and " if before else ""
         raise SetupError(
-            f"{venv} has {free / 1e9:.1f} GB of free disk space, {part} needs {needed / 1e9:.1f} GB; make room and run "
-            "the same command again"
+            f"{reason}{venv} has {free / 1e9:.1f} GB of free disk space, {part} needs {needed / 1e9:.1f} GB; make "
+            "room and run the same command again"
         )
 
 

@@ -197,17 +197,33 @@ def test_the_size_of_the_cuda_build_is_told_before_it_is_fetched(tmp_path, monke
     monkeypatch.setattr(install, "pip", pip)
     monkeypatch.setattr(install, "nvidia", lambda: gpu)
     monkeypatch.setattr(sys, "platform", "linux")
+    disk(monkeypatch, 10e9)
     install.install_torch(tmp_path / "bin/python", tmp_path)
     assert sizes in told[-1][1] and "+cpu" not in told[-1][0]
     assert not any(sizes in said for _, said in told[:-1])
 
 
-def test_the_cuda_build_is_not_begun_on_a_disk_without_room(tmp_path, monkeypatch):
-    monkeypatch.setattr(install, "pip", lambda *_: pytest.fail("pip ran"))
-    monkeypatch.setattr(install, "nvidia", lambda: True)
+def disk(monkeypatch: pytest.MonkeyPatch, free: float) -> None:
+    """A disk with so many free bytes, whatever this machine's has."""
+    usage = shutil._ntuple_diskusage(20e9, 20e9 - free, free)
+    monkeypatch.setattr(install.shutil, "disk_usage", lambda _: usage)
+
+
+@pytest.mark.parametrize(("gpu", "reason"), [(True, "^"), (False, "^the registry is away; and ")])
+def test_the_cuda_build_is_not_begun_on_a_disk_without_room(tmp_path, monkeypatch, gpu, reason):
+    """Without a GPU the reason that the CPU build was not taken comes first: it is the one to mend."""
+
+    def pip(python: Path, venv: Path, *arguments: str) -> str:
+        assert "+cpu" in arguments[-1], "the CUDA build was begun"
+        return "the registry is away"
+
+    monkeypatch.setattr(install, "pip", pip)
+    monkeypatch.setattr(install, "nvidia", lambda: gpu)
     monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setattr(install.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10e9, 6e9, 4e9))
-    with pytest.raises(environment.SetupError, match=r"4\.0 GB of free disk space.*needs 4\.7 GB; make room"):
+    disk(monkeypatch, 4e9)
+    with pytest.raises(
+        environment.SetupError, match=rf"{reason}/.*4\.0 GB of free disk space.*needs 4\.7 GB; make room"
+    ):
         install.install_torch(tmp_path / "bin/python", tmp_path)
 
 
