@@ -74,9 +74,12 @@ def _pairs(position: np.ndarray, normal: np.ndarray, chosen: Int[np.ndarray, " n
 
 
 def with_sun(
-    cells: LightCells, radiance: Float[np.ndarray, "k 3"], sun: Sun
+    cells: LightCells, radiance: Float[np.ndarray, "k 3"], sun: Sun | None
 ) -> tuple[LightCells, Float[np.ndarray, "n 3"]]:
-    """The cells with the sun as the last of them, and their radiance; the sun begins as bright as its surroundings."""
+    """The cells with the sun, if any, as the last of them, and their radiance; it begins as bright as its
+    surroundings."""
+    if sun is None:
+        return cells, radiance
     own = radiance[int((cells.direction @ sun.direction).argmax())]
     direction = np.concatenate([cells.direction, sun.direction[None]])
     whole = LightCells(direction, np.concatenate([cells.angle, [SUN]]), cells.pairs)

@@ -25,17 +25,17 @@ from mistyle.solver.photometry.material import MaterialSamples, corrected_sample
 from mistyle.solver.photometry.record import Gains
 from mistyle.solver.prior import LEAST_SEEN
 from mistyle.solver.texels.gbuffer import open_sky
-from mistyle.solver.texels.levenberg_marquardt import Options, Points, Problem, Rig
+from mistyle.solver.texels.levenberg_marquardt import Options, Points, Problem, Rig, Solution
 from mistyle.solver.texels.light_transport import light_transport_matrix
 from mistyle.solver.texels.observations import TexelObservations
 
 # Prior of a texel's unknowns: means and standard deviations. The prior keeps tilts small; otherwise errors of the
-# light would tilt the whole surface.
+# light would tilt the whole surface. Albedo is nearly free: thousands of texels that lean to grey, each a little, would
+# set the scale and the colour of the light.
 MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.6, 0.0)
-SPREAD = (1.0, 1.0, 1.0, 0.1, 0.1, 0.3, 0.1)
+SPREAD = (10.0, 10.0, 10.0, 0.1, 0.1, 0.3, 0.1)
 SMOOTH = 0.05  # weight of the squared relative difference between neighbouring cells
 FLAT = 0.05  # floor of the brightness that scales differences, as a share of the mean radiance
-CONVENTION = 0.1  # weight of the mean light's squared relative distance from the convention, per observation
 STEP = 0.01  # of finite differences by tilt, roughness and metallic
 BLOCK = 1024  # texels per batch
 TRIES, INNER = 5, 8  # damping values per step; iterations of the texel solver after it
@@ -50,7 +50,7 @@ Values = Float[np.ndarray, "t 7"]
 @dataclass(frozen=True)
 class Bundle:
     """The constants of the solve: `owner` is each observation's texel, `used` whether its texel has at least
-    LEAST_SEEN observations, `free` the number of free unknowns per texel.
+    LEAST_SEEN observations, `free` the number of free unknowns per texel, `mean` the mean of its prior.
 
     samples  the observations as photographed, with `used` texels alone; None where their exposures are known
     """
@@ -61,6 +61,7 @@ class Bundle:
     owner: Int[np.ndarray, " o"]
     used: Bool[np.ndarray, " o"]
     free: int
+    mean: Values
     samples: MaterialSamples | None = None
 
     @property
@@ -87,10 +88,11 @@ def bundle(
     normal: Float[np.ndarray, "t 3"],
     cells: LightCells,
     options: Options,
+    mean: Values,
     samples: MaterialSamples | None = None,
 ) -> Bundle:
-    """The problem with these cells as the environment; `normal` is the geometric normal of the texels. `samples` are
-    all observations, where their gains are to be solved."""
+    """The problem with these cells as the environment; `normal` is the geometric normal of the texels, `mean` that of
+    their prior. `samples` are all observations, where their gains are to be solved."""
     points, count, number = observed.points, len(cells.angle), len(observed.rig.eye)
     visibility = open_sky(traced, points.position, normal, cells.direction.astype(np.float32))
     first = count * np.arange(number + 1)
@@ -106,12 +108,7 @@ def bundle(
     problem = Problem(Points(points.position, points.frame, visibility), rig, observed.observations, options)
     owner = np.repeat(np.arange(len(observed.texel)), observed.seen)
     used = (observed.seen >= LEAST_SEEN)[owner]
-    return Bundle(observed, cells, problem, owner, used, 7 if options.metallic else 6, samples)
-
-
-def first_values(bundled: Bundle) -> Values:
-    """The start values of the texels, the prior's means: grey, flat and rough."""
-    return np.tile(np.array(MEAN, np.float32), (len(bundled.observed.texel), 1))
+    return Bundle(observed, cells, problem, owner, used, 7 if options.metallic else 6, mean, samples)
 
 
 def texels_under(bundled: Bundle, radiance: Radiance, start: Values, steps: int, gains: Gains | None = None) -> State:
@@ -121,13 +118,18 @@ def texels_under(bundled: Bundle, radiance: Radiance, start: Values, steps: int,
     if gains is not None:
         bundled.problem.retarget(seen)
         bundled.problem.reweight(weight)
-    mean, prior = first_values(bundled), _prior(len(start))
-    solution = bundled.problem.solve(start, mean, prior, steps)
-    cost = solution.cost + ((solution.values - mean) ** 2 * prior).sum(axis=1)
+    solution, cost = solved_texels(bundled, start, bundled.mean, steps)
     residual = (seen - bundled.problem.predict(solution.values))[bundled.used]
     residual = np.sqrt((residual.astype(float) ** 2).sum() / max(float((seen[bundled.used] ** 2).sum()), 1e-30))
     reliable = bundled.observed.seen >= LEAST_SEEN
     return State(radiance, solution.values, float(cost[reliable].sum()), float(residual), gains)
+
+
+def solved_texels(bundled: Bundle, start: Values, mean: Values, steps: int) -> tuple[Solution, Float[np.ndarray, " t"]]:
+    """The texels' solution with these means of the prior, and its cost with the prior's part."""
+    prior = np.tile(1 / np.array(SPREAD, np.float32) ** 2, (len(start), 1))
+    solution = bundled.problem.solve(start, mean, prior, steps)
+    return solution, solution.cost + ((solution.values - mean) ** 2 * prior).sum(axis=1)
 
 
 def _corrected(bundled: Bundle, gains: Gains | None) -> tuple[np.ndarray, np.ndarray]:
@@ -151,12 +153,14 @@ def solve_light_and_texels(
     bundled: Bundle,
     state: State,
     convention: Callable[[Bundle, State], Float[np.ndarray, "3"]],
+    weight: float,
     steps: int,
     progress: Callable[[State], None],
 ) -> State:
-    """At most `steps` joint steps; `convention` gives a state's mean radiance under the convention."""
+    """At most `steps` joint steps. `convention` gives a state's mean radiance under the convention; `weight` is that
+    of the mean radiance's squared relative distance from it, per observation."""
     damping = 1e-2
-    weight = CONVENTION * int(bundled.used.sum())
+    weight = weight * int(bundled.used.sum())
     more = bundled.more
     for _ in range(steps):
         matrix, gradient = _system(bundled, state, follow=True)
@@ -187,10 +191,6 @@ def solve_light_and_texels(
         if after > before * (1 - SETTLED):
             return state
     return state
-
-
-def _prior(count: int) -> Values:
-    return np.tile(1 / np.array(SPREAD, np.float32) ** 2, (count, 1))
 
 
 def _relight(bundled: Bundle, radiance: Radiance) -> None:
@@ -283,7 +283,7 @@ def _schur_terms(
         own = by_texel[rows][:, :, :free]
         normal = summed(np.einsum("oci,ocj->oij", own, own)).astype(float) + np.diag(prior[:free])
         rhs = summed(np.einsum("oci,oc->oi", own, residual[rows]))
-        rhs = rhs - prior[:free] * (values[texel, :free] - np.array(MEAN)[:free])
+        rhs = rhs - prior[:free] * (values[texel, :free] - bundled.mean[texel, :free])
         factor = np.linalg.cholesky(normal)
         whole = np.zeros((len(texel), free - 3, 3 * cells))
         for c, block in enumerate(blocks):

@@ -274,7 +274,9 @@ def with_light(run: Run, asset: Asset, captures: Captures, found: Any = None) ->
     card = [run.job.albedo_of] if run.job.albedo_of is not None else []
 
     def solved(report: Report) -> Any:
-        first = found or find_light(asset.mesh, captures, s.recover, report, outside=s.light.sun)
+        first = found or find_light(
+            asset.mesh, captures, s.recover, report, outside=s.light.sun, materials=asset.materials
+        )
         return with_known_albedo(run, asset, captures, first)
 
     estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)

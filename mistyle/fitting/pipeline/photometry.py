@@ -79,8 +79,9 @@ def _explained(
     if job.lights == "unknown":
         begin = Gains(np.zeros((n, 3)), np.zeros(3))
         light = find_light(
-            asset.mesh, captures, s.recover, lambda done: report(0.7 * done), outside=s.light.sun, gains=begin
-        )
+            asset.mesh, captures, s.recover, lambda done: report(0.7 * done), outside=s.light.sun, gains=begin,
+            materials=asset.materials,
+        )  # fmt: skip
         captures, start = replace(captures, lights=(light.lights,) * n), light.gains
     options = Options(s.recover.model, floor=s.recover.roughness_floor)
     tangents = tangents_of(asset.mesh, s.recover.frame)
