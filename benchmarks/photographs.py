@@ -12,7 +12,7 @@ pixels wide, and the same averaged until it is two and one: `texel_of_4.…`, `t
 `normal_mean_deg`, `roughness_mse`, `albedo_psnr` and `seconds`. --quick runs it small, and a `large` of 6 pictures of 3
 megapixels.
 
-`real_size` (only by `--only real_size`): a fit of an atlas of 4096² to 200 photographs of 12 megapixels (links to 12
+`real_size` (only by `--only real_size`): a fit of an atlas of 4096² to 204 photographs of 12 megapixels (links to 12
 renders) within --memory, of the first --passes alone. Figures: `real_size.pictures`, `.megapixels`, `.atlas`,
 `.asked_gb`, `.plan_gb`, `.peak_gb` (resident, of all processes together), `.peak_over_plan`, `.seconds`, `.passes`,
 `.passes_planned`, `.seconds_planned` and `.seconds_extrapolated`: those of all passes, the latter at the ratio of
@@ -162,7 +162,7 @@ def real_size(place: Path, options: argparse.Namespace) -> dict[str, float]:
     mesh, folder = find_asset("waterbottle", data_folder()), place / "real_photographs"
     size = (480, 640) if options.quick else (3000, 4000)
     views = min(4, max(1, options.pictures // 3))
-    count = photograph(mesh, folder, views, size, (0.0, 0.0, 0.0), max(1, options.pictures // (3 * views)))
+    count = photograph(mesh, folder, views, size, (0.0, 0.0, 0.0), max(1, -(-options.pictures // (3 * views))))
     words = ["fit", mesh, folder, "-o", place / "real_run", "--set", "references.saturation=0.99"]
     words += ["--atlas", options.atlas, "--memory", f"{options.memory:g}G", "--set", "report.frames=4"]
     planned = run_mistyle(*words, "--dry-run")

@@ -103,10 +103,8 @@ def find_light(
     chosen = np.array(evenly(len(captures), PICTURES))
     noise = (NOISE, RELATIVE) if gains is None else NOISY
     cameras, texels, observed = _observations(traced, captures, settings, chosen, noise)
-    samples, own = None, None
-    if gains is not None:
-        samples = all_samples(observed, cameras, noise)
-        own = Gains(gains.gain[chosen], gains.vignetting)
+    samples = None if gains is None else all_samples(observed, cameras, noise)
+    own = None if gains is None else Gains(gains.gain[chosen], gains.vignetting)
     normal = np.concatenate([t.normal[t.covered] for t in texels])
     options = Options(settings.model, settings.metallic, floor=max(FLOOR, settings.roughness_floor))
     residuals: list[float] = []
