@@ -39,9 +39,9 @@ if TYPE_CHECKING:
 STARTING = 1  # of the program
 ALIGNED = 1.5  # of a mesh that is aligned
 PER_OUTLINE = 0.003  # a picture that is placed, and its outline checked
-PER_MATCHED, PER_EXPLAINED = 0.15, 0.8  # a picture whose exposure is solved by points, and with a material
+PER_MATCHED, PER_EXPLAINED = 0.15, 0.65  # a picture whose exposure is solved by points, and with a material
 # Of an unknown light; where exposures are solved, the mean of fits that they gave the light and of others.
-LIGHT_SECONDS, LEFT_LIGHT = 12, 4
+LIGHT_SECONDS, LEFT_LIGHT = 15, 6
 PER_FIRST_TEXEL, FIRST_TEXELS = 3e-6, 512**2  # a texel of the first asset, and most of them
 
 
@@ -73,7 +73,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": cameras_seconds(job, shots, sizes) + first_asset_seconds(len(sizes), texels, read),
         **({"photometry": 8 + PER_MATCHED * len(sizes) + read} if matched else {}),
-        **({"exposures": 7 + PER_EXPLAINED * len(sizes)} if matched else {}),
+        **({"exposures": 5 + PER_EXPLAINED * len(sizes) + LIGHT_SECONDS * unknown} if matched else {}),
         "pictures": read,
         **({"light": LEFT_LIGHT if matched else LIGHT_SECONDS} if unknown else {}),
         "recover": recover_seconds(s, averaged, covered, soft, visible),
