@@ -6,7 +6,7 @@ Pictures are 8-bit JPEGs with exposures of ±1 EV, white balances of ±10 % and 
 `phone` (Suzanne and Avocado with their own maps, 24 views under a sky that the fit does not know):
 
     phone.relight_psnr_l, phone.albedo_psnr_scaled  after a factor per channel; means over the assets
-    phone.exposure_error                            largest error of a gain, relative
+    phone.exposure_error                            largest error of a gain, relative (where gains were solved)
     phone.seconds                                   of a fit
 
 `--only bounds`: the same figures as `bounds.clean.*` (clean pictures, unknown sky, no photometry) and
@@ -96,7 +96,7 @@ def known(place: Path, quick: bool) -> dict[str, float]:
         for key, (own, mode) in tried.items():
             row = fitted(place / f"{name}_{key}", drawn, own, [*words, "--photometry", mode])
             ratio = {part: row[part] / clean[part] for part in MAPS}
-            _print(f"{name} {key}", ratio | {part: row[part] for part in ("exposure_error", "seconds")})
+            _print(f"{name} {key}", ratio | {part: row[part] for part in ("exposure_error", "seconds") if part in row})
             figures[f"known.{key}"] = max(figures[f"known.{key}"], *ratio.values())
             if key == "maps_ratio":
                 figures["known.exposure_error"] = max(figures["known.exposure_error"], row["exposure_error"])
@@ -129,7 +129,8 @@ def _under_sky(name: str, place: Path, quick: bool, words: Sequence[Any], *, cle
 def _summary(part: str, rows: Sequence[dict[str, float]]) -> dict[str, float]:
     keys = ("relight_psnr_l", "albedo_psnr_scaled", "seconds")
     figures = {f"{part}.{key}": float(np.mean([row[key] for row in rows])) for key in keys}
-    return figures | {f"{part}.exposure_error": max(row["exposure_error"] for row in rows)}
+    errors = [row["exposure_error"] for row in rows if "exposure_error" in row]
+    return figures | ({f"{part}.exposure_error": max(errors)} if errors else {})
 
 
 def _print(name: str, row: dict[str, float]) -> None:
@@ -188,7 +189,7 @@ def fitted(place: Path, drawn: Drawn, done: Gains, words: Sequence[Any]) -> dict
     start = time.perf_counter()
     run_mistyle("fit", drawn.file, place / "shots", "-o", place / "out", "--masks", place / "shots" / "masks",
                 "--atlas", size, *words)  # fmt: skip
-    result = {"seconds": time.perf_counter() - start, "exposure_error": float("nan")}
+    result = {"seconds": time.perf_counter() - start}
     record = place / "out" / "work" / "exposures" / "record"
     if record.exists():
         solved = gains_of(load_record(record).photometry).gain
