@@ -56,11 +56,11 @@ def captures(mesh, sky, own):
     return photographed(mesh, sky, own)
 
 
-def photographed(mesh: Mesh, sky: Environment, maps: Maps, depth: int = 2) -> Captures:
-    """Pictures by direct light, which is all that the model has; more of `depth` adds interreflection."""
+def photographed(mesh: Mesh, sky: Environment, maps: Maps) -> Captures:
+    """Pictures by direct light, which is all that the model has."""
     cameras = drawing.fibonacci(10, 96)
     shots = [drawing.Shot(c, (sky,)) for c in cameras]
-    pictures = drawing.render(mesh, [maps], shots, frame="mikkt", spp=16, depth=depth)
+    pictures = drawing.render(mesh, [maps], shots, frame="mikkt", spp=16, depth=2)
     return in_memory(
         cameras, [()] * len(cameras), [p[..., :3] for p in pictures], [p[..., 3] > 0.999 for p in pictures]
     )
