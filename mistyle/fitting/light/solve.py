@@ -65,6 +65,11 @@ class Bundle:
     samples: MaterialSamples | None = None
 
     @property
+    def reliable(self) -> Bool[np.ndarray, " t"]:
+        """Whether each texel has at least LEAST_SEEN observations."""
+        return self.observed.seen >= LEAST_SEEN
+
+    @property
     def more(self) -> int:
         """Unknowns of a channel beside the cells' radiances: gains and vignetting."""
         return 0 if self.samples is None else self.samples.pictures + 3
@@ -121,8 +126,7 @@ def texels_under(bundled: Bundle, radiance: Radiance, start: Values, steps: int,
     solution, cost = solved_texels(bundled, start, bundled.mean, steps)
     residual = (seen - bundled.problem.predict(solution.values))[bundled.used]
     residual = np.sqrt((residual.astype(float) ** 2).sum() / max(float((seen[bundled.used] ** 2).sum()), 1e-30))
-    reliable = bundled.observed.seen >= LEAST_SEEN
-    return State(radiance, solution.values, float(cost[reliable].sum()), float(residual), gains)
+    return State(radiance, solution.values, float(cost[bundled.reliable].sum()), float(residual), gains)
 
 
 def solved_texels(bundled: Bundle, start: Values, mean: Values, steps: int) -> tuple[Solution, Float[np.ndarray, " t"]]:
@@ -268,7 +272,7 @@ def _schur_terms(
     whitened cross terms have one block; the other unknowns' rows have three.
     """
     start, prior, cells = bundled.observed.observations.start, np.array(SPREAD) ** -2.0, by_light[0].shape[1]
-    seen, free = np.flatnonzero(bundled.observed.seen >= LEAST_SEEN), bundled.free
+    seen, free = np.flatnonzero(bundled.reliable), bundled.free
     schur, slope = np.zeros((3 * cells, 3 * cells)), np.zeros(3 * cells)
     blocks = [slice(c * cells, (c + 1) * cells) for c in range(3)]
     for low in range(0, len(seen), BLOCK):

@@ -14,15 +14,13 @@ from jaxtyping import Bool
 from mistyle.atlas.texels import start_maps
 from mistyle.core.asset import Material
 from mistyle.core.maps import Texels
-from mistyle.fitting.light.solve import MEAN, Bundle, State, Values, solved_texels, texels_under
+from mistyle.fitting.light.solve import INNER, MEAN, Bundle, State, Values, solved_texels, texels_under
 from mistyle.render.deferred.material_table import METALLIC, ROUGHNESS
-from mistyle.solver.prior import LEAST_SEEN
 from mistyle.solver.table import Atlas
 from mistyle.solver.texels.classes import apparent_albedo, metal_regions
 
 STARTS = (0.2, 0.6)  # roughness has local minima
 STEPS = 16  # of the texel solver from each start
-INNER = 8  # of it under another prior
 UPDATES = 3  # of the mean roughness
 
 
@@ -45,7 +43,7 @@ def metals(bundled: Bundle, state: State, atlas: Atlas) -> Bool[np.ndarray, " t"
             start[:, ROUGHNESS] = rough
             tried.append(solved_texels(bundled, start, mean, STEPS)[1])
         costs.append(np.minimum(*tried))
-    evidence = np.where(bundled.observed.seen >= LEAST_SEEN, costs[0] - costs[1], 0)
+    evidence = np.where(bundled.reliable, costs[0] - costs[1], 0)
     return metal_regions(evidence, apparent_albedo(bundled.problem, bundled.observed), bundled.observed.texel, atlas)
 
 
@@ -59,7 +57,7 @@ def with_metals(bundled: Bundle, state: State, metal: Bool[np.ndarray, " t"]) ->
 
 def with_common_roughness(bundled: Bundle, state: State) -> tuple[Bundle, State]:
     """The prior's roughness is the mean of each class's texels, found by expectation maximisation."""
-    seen = bundled.observed.seen >= LEAST_SEEN
+    seen = bundled.reliable
     for _ in range(UPDATES):
         mean, metal = bundled.mean.copy(), bundled.mean[:, METALLIC] > 0.5
         for own in (metal, ~metal):

@@ -57,8 +57,8 @@ class Convention:
     weight: float
 
 
-# Real base colours (173 textured glTF files): half of them between 0.21 and 0.74, geometric mean 0.40, median 0.57.
 # White at first: from lights that are too dim the classes are right, from those that are too bright they are not.
+# Then a middling brightness: real base colours lie on both sides of it.
 FIRM, LOOSE = Convention(0.8, 0.1), Convention(0.5, 0.01)
 
 
@@ -93,8 +93,8 @@ def find_light(
     metallic of `materials`, 0 without any, holds unless the settings fit it.
 
     Needs views from around the object. A surface without highlights determines the light only at low frequencies.
-    Direct light and shadows are modelled, interreflection is not: where it is a tenth of the radiance, the light was
-    found 1.4 times too bright. Raises InputRefused where no texel is seen.
+    Direct light and shadows are modelled, interreflection is not: on concave surfaces the light comes out too bright.
+    Raises InputRefused where no texel is seen.
     """
     from mistyle.render.mitsuba.draw import tracer
     from mistyle.solver.texels.levenberg_marquardt import Options
@@ -158,7 +158,7 @@ def _relit(bundled: Bundle, state: State, radiance: light_cells.Radiance) -> Sta
     """The texels of `state` under other cells, whose radiance starts as given."""
     for _ in range(3):
         radiance = light_solve.light_over(bundled, radiance, state.values, state.gains)
-    return light_solve.texels_under(bundled, radiance, state.values, 8, state.gains)
+    return light_solve.texels_under(bundled, radiance, state.values, light_solve.INNER, state.gains)
 
 
 def _lights_of(
@@ -211,11 +211,11 @@ def _start_state(bundled: Bundle, gains: Gains | None = None) -> State:
     radiance = np.full((len(bundled.cells.angle), 3), max(middle, 1e-6))
     radiance = light_solve.light_over(bundled, radiance, values, gains)
     for _ in range(2):
-        state = light_solve.texels_under(bundled, radiance, values, 8, gains)
+        state = light_solve.texels_under(bundled, radiance, values, light_solve.INNER, gains)
         factor = _factor(bundled, state, FIRM.bright)
         values, radiance = state.values.copy(), state.radiance / factor
         values[:, ALBEDO] = np.clip(values[:, ALBEDO] * factor, 0, 1)
-    return light_solve.texels_under(bundled, radiance, values, 8, gains)
+    return light_solve.texels_under(bundled, radiance, values, light_solve.INNER, gains)
 
 
 def _factor(bundled: Bundle, state: State, bright: float) -> Float[np.ndarray, "3"]:
