@@ -127,6 +127,7 @@ MATERIAL_PRESETS: dict[str, dict[str, Any]] = {
             "bounce_samples": 32,
             "solver_texels": 500_000,
             "soft_subsamples": 1,
+            "soft_cells": 32,
             "soft_bounces": 0,
             "soft_measured": 32,
             "detail": True,
