@@ -105,8 +105,8 @@ class RecoverSettings(BaseModel):
         default=128,
         ge=8,
         le=512,
-        description="cells of such light in a sample; with 32 a pixel is wrong by a tenth or more, and Adam fits "
-        "normals to that",
+        description="cells of such light in a sample; pictures of few cells are noisy, and Adam fits normals to the "
+        "noise",
     )
     soft_bounces: int = Field(
         default=8, ge=0, le=8, description="most estimates of indirect light under environments and ambient light"

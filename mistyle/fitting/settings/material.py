@@ -128,7 +128,7 @@ MATERIAL_PRESETS: dict[str, dict[str, Any]] = {
             "solver_texels": 500_000,
             "soft_subsamples": 1,
             "soft_cells": 32,
-            "soft_bounces": 0,
+            "soft_bounces": 1,
             "soft_measured": 32,
             "detail": True,
         },
