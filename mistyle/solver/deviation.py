@@ -6,7 +6,7 @@ ambiguous. (Off its highlight a smooth metal looks like a rough one of lower F0.
 1. `open_std`: what a texel's own observations leave open. The tilts' prior is estimated from the surface, so it and
    their neighbours count too.
 2. The change by Adam on whole pictures where no joint steps follow: two estimates of one truth, from different
-   approximations of light and pixels, differ by their errors.
+   approximations of light and pixels, differ by their errors. Stated is the root of the mean of both squares.
 3. Metallic is 0 or 1. Up to the class, its error is known: its distance from the nearer of both (`class_std`).
 """
 

@@ -396,8 +396,9 @@ def _stated(context: FitContext, estimate: TexelEstimate, table: MaterialTable) 
     settings = context.settings
     if not estimate.solved:
         return estimate.std
-    moved = (table - estimate.table)[:, SOLVED] * (descent_steps(settings) > 0 and not settings.joint)
-    stated = np.sqrt(estimate.std**2 + moved**2)
+    stated = estimate.std.copy()
+    if descent_steps(settings) > 0 and not settings.joint:
+        stated = np.sqrt((estimate.std**2 + (table - estimate.table)[:, SOLVED] ** 2) / 2)
     if settings.metallic:
         sure = estimate.std[:, METALLIC]
         stated[:, METALLIC] = class_std(table[:, METALLIC], sure, estimate.seen > 0, context.atlas)
