@@ -127,7 +127,6 @@ MATERIAL_PRESETS: dict[str, dict[str, Any]] = {
             "bounce_samples": 32,
             "solver_texels": 500_000,
             "soft_subsamples": 1,
-            "soft_cells": 32,
             "soft_bounces": 1,
             "soft_measured": 32,
             "detail": True,
