@@ -210,7 +210,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     """The cameras in working space: unchanged, converted from the mesh's units, or aligned and refined on request; and
     the overlap of the mesh's outlines with the masks."""
     from mistyle.geometry.similarity import moved, upright
-    from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
+    from mistyle.io.cameras.captures import camera_space, matte_note, outline_of, silhouette, sparse_points
     from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
     from mistyle.solver.cameras.outline_check import check_outlines, overlap_notes
 
@@ -218,10 +218,11 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     captures = upright(captures) if chosen.up == "z" else captures
     figures: dict[str, float] = {}
     notes: list[str] = []
+    inner: list[float] = []
     masks, sparse = None, sparse_points(job.references) if chosen.align else None
     if chosen.align or chosen.refine_poses:
         try:
-            masks = [silhouette(shot) for shot in shots]
+            masks = [silhouette(shot, inner.append) for shot in shots]
         except InputRefused:
             if sparse is None or chosen.refine_poses or job.masks is not None:
                 raise
@@ -238,7 +239,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     elif camera_space(job.references) == "own":
         captures = moved(captures, asset.source.work_from_user)
     report(0.3)
-    outlines = (outline_of(shot) for shot in shots) if masks is None else masks
+    outlines = (outline_of(shot, inner.append) for shot in shots) if masks is None else masks
     if chosen.refine_poses:
         refined = refine_poses(
             asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.3 + 0.5 * done)
@@ -253,7 +254,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     if np.isfinite(overlaps.overlap).any():
         mean, least = float(np.nanmean(overlaps.overlap)), float(np.nanmin(overlaps.overlap))
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}
-    return Placed(captures.cameras, captures.lights, (*notes, *warnings), figures, overlaps.overlap)
+    return Placed(captures.cameras, captures.lights, (*notes, *warnings, *matte_note(inner)), figures, overlaps.overlap)
 
 
 def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures, placed: Placed) -> tuple[Captures, Placed]:

@@ -99,8 +99,10 @@ def first_asset_seconds(count: int, texels: float, read: float) -> float:
 
 
 def cameras_seconds(job: Any, shots: Sequence["CapturedPicture"], sizes: Sequence[int]) -> float:
-    """Seconds of placing the cameras: masks and alpha are read."""
-    masked = sum(n for n, shot in zip(sizes, shots, strict=True) if shot.mask is not None or shot.alpha_of is not None)
+    """Seconds of placing the cameras: masks, and pictures that can have an alpha, are read."""
+    from mistyle.io.cameras.captures import may_have_alpha
+
+    masked = sum(n for n, shot in zip(sizes, shots, strict=True) if shot.mask is not None or may_have_alpha(shot))
     aligned = ALIGNED * (job.settings.references.align + job.settings.references.refine_poses * len(sizes))
     return 0.1 + aligned + PER_OUTLINE * len(sizes) + masked * PER_READ_PIXEL
 

@@ -11,7 +11,8 @@ A camera describes either stored pixels or upright ones (EXIF orientation, see i
 `CapturedPicture.pixels`, for both the picture and the mask of a view.
 
 Valid pixels are finite, not saturated (an encoded channel at its maximum), wholly inside the alpha and inside the
-user's mask. A partly covered pixel shows the background too.
+user's mask. A partly covered pixel shows the background too. Background removers write mattes that stay just below 1
+inside the object: there the median takes the place of 1 (`least_alpha`).
 
 The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops times as bright as the radiance),
 `{"factor": {picture: factor, ...}}`, or the names and stops alone.
@@ -70,6 +71,10 @@ EXPECTED = (
 )
 KEPT = 2  # pictures held decoded
 TRANSFORMS = ("transforms.json", "transforms_train.json")
+OPAQUE = (".jpg", ".jpeg", *RAW)  # have no alpha, so they need not be decoded for it
+WHOLE = 0.999  # least alpha of a valid pixel of a rendered picture
+# A matte whose median inside the object is from MATTE to WHOLE; a valid pixel's alpha is at most BELOW under it.
+MATTE, BELOW = 0.95, 0.02
 
 
 @dataclass(frozen=True)
@@ -102,7 +107,7 @@ def read_captures(
     exposure: Path | Mapping[str, float] | None = None,
     pictures: Path | None = None,
     saturation: float = 1.0,
-    coverage: float = 0.999,
+    coverage: float = WHOLE,
 ) -> Captures:
     """The references of a fit, in the space of `camera_space`; headers are read now, pixels one picture at a time.
 
@@ -114,7 +119,7 @@ def read_captures(
     pictures    the folder of the pictures, where it is elsewhere; missing folders of a camera file's picture names are
                 dropped
     saturation  encoded value 0..1 at which a channel counts as saturated (JPEGs often stay below 1)
-    coverage    least alpha 0..1 of a valid pixel; its colour is unpremultiplied
+    coverage    least alpha 0..1 of a valid pixel, less for mattes (`least_alpha`); its colour is unpremultiplied
 
     Refused: cameras without pictures, pictures or masks of another size than their camera, views without lights,
     masks or exposures for some views only. `check_pixels` checks the pixel values.
@@ -219,11 +224,11 @@ def sparse_points(path: Path) -> SparsePoints | None:
     return read_colmap_points(file) if kind == "colmap" else None
 
 
-def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 0.999) -> Loaded:
+def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = WHOLE) -> Loaded:
     """Linear radiance in the shot's pinhole camera, 0 at invalid pixels, and the mask of valid pixels."""
     rgb, alpha, usable = _decoded(shot, saturation)
     if alpha is not None:
-        usable = usable & (alpha >= coverage)
+        usable = usable & (alpha >= least_alpha(inner_alpha(alpha), coverage))
         if shot.picture.suffix.lower() == ".exr":
             rgb = rgb / np.maximum(alpha, 1e-6)[..., None]
     if shot.mask is not None:
@@ -233,19 +238,44 @@ def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 
     return resample(shot.lens, rgb, usable)
 
 
-def silhouette(shot: CapturedPicture) -> Bool[np.ndarray, "h w"]:
-    """The object's mask in the pinhole camera, from the user's mask, else from the picture's alpha (at least half).
+def inner_alpha(alpha: Float[np.ndarray, "h w"]) -> float:
+    """The median alpha inside the object, where it is at least half; 1 where it is nowhere."""
+    inside = alpha[alpha >= 0.5]
+    return float(np.median(inside)) if inside.size else 1.0
+
+
+def least_alpha(inner: float, coverage: float = WHOLE) -> float:
+    """The least alpha of a valid pixel: `coverage`, or BELOW the median `inner` of a matte that never reaches it."""
+    return inner - BELOW if MATTE <= inner < coverage else coverage
+
+
+def matte_note(inner: Sequence[float]) -> tuple[str, ...]:
+    """A sentence about the mattes among the alphas with these medians; none without any."""
+    mattes = [value for value in inner if least_alpha(value) < WHOLE]
+    if not mattes:
+        return ()
+    return (
+        f"The alpha of {len(mattes)} pictures stays below 1 inside the object (medians {min(mattes):.3f} to "
+        f"{max(mattes):.3f}), as mattes of background removers do: pixels count down to {BELOW:g} below the median.",
+    )
+
+
+def silhouette(shot: CapturedPicture, seen: Callable[[float], None] = lambda inner: None) -> Bool[np.ndarray, "h w"]:
+    """The object's mask in the pinhole camera, from the user's mask, else from the picture's alpha (at least half);
+    `seen` is given the alpha's median (`inner_alpha`).
 
     Refused: a picture without either.
     """
-    outline = outline_of(shot)
+    outline = outline_of(shot, seen)
     if outline is None:
         fix = "Hand in masks (a folder with a picture of the same name per view)"
         raise refuse(shot.picture, "neither an alpha channel nor a mask", "to know where the object is", fix)
     return outline
 
 
-def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
+def outline_of(
+    shot: CapturedPicture, seen: Callable[[float], None] = lambda inner: None
+) -> Bool[np.ndarray, "h w"] | None:
     """As `silhouette`; None for a picture that has neither alpha nor mask."""
     if shot.mask is not None:
         covered = _inside(shot.mask, shot.pixels)
@@ -254,6 +284,7 @@ def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
         if alpha is None:
             return None
         covered = alpha >= 0.5
+        seen(inner_alpha(alpha))
     everywhere = np.ones_like(covered)
     return resample(shot.lens, covered[..., None].astype(np.float32), everywhere)[0][..., 0] >= 0.5
 
@@ -434,13 +465,16 @@ def _unsaturated(encoded: np.ndarray, saturation: float) -> Bool[np.ndarray, "h 
     return np.asarray(np.logical_and.reduce(below))
 
 
+def may_have_alpha(shot: CapturedPicture) -> bool:
+    """Whether the picture, or an EXR that it replaces, may have an alpha, by its ending."""
+    return shot.picture.suffix.lower() not in OPAQUE or shot.alpha_of is not None
+
+
 def _alpha(shot: CapturedPicture) -> Float[np.ndarray, "h w"] | None:
     """The alpha of the picture, or of the EXR that it replaces."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")
-    kind = shot.picture.suffix.lower()
-    # JPEGs and RAW files have none, so they need not be decoded.
-    if kind not in (".jpg", ".jpeg", *RAW):
+    if shot.picture.suffix.lower() not in OPAQUE:
         alpha = read_stored_pixels(shot.picture, shot.pixels)[1]
         if alpha is not None:
             return alpha
