@@ -96,7 +96,8 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     from mistyle.deliver.colour import in_working_space, key_of
     from mistyle.deliver.export import check, deliver
     from mistyle.fitting.report.material import material_report, write_summary
-    from mistyle.io.cameras.captures import read_shots, reading_notes
+    from mistyle.io.cameras.captures import read_shots
+    from mistyle.io.cameras.reading_notes import reading_notes
     from mistyle.jobs.run_record import old_report
 
     files = input_files(job.mesh)
@@ -210,7 +211,8 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     """The cameras in working space: unchanged, converted from the mesh's units, or aligned and refined on request; and
     the overlap of the mesh's outlines with the masks."""
     from mistyle.geometry.similarity import moved, upright
-    from mistyle.io.cameras.captures import camera_space, matte_note, outline_of, silhouette, sparse_points
+    from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
+    from mistyle.io.cameras.reading_notes import matte_note
     from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
     from mistyle.solver.cameras.outline_check import check_outlines, overlap_notes
 

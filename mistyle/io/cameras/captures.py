@@ -19,7 +19,7 @@ The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops t
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -84,6 +84,7 @@ class CapturedPicture:
     camera       the pinhole camera that it is resampled to
     lens         the lens of the photograph
     pixels       the pixels of picture and mask that these two describe (io/cameras/camera_files.py)
+    named        the picture's name in the camera file; empty for our own
     factor       the exposure factor of its radiance
     alpha_of     an EXR whose A is the alpha of a picture without its own
     orientation  the EXIF orientations 1..8 of picture and mask (1: none)
@@ -93,6 +94,7 @@ class CapturedPicture:
     lens: Lens
     picture: Path
     pixels: Pixels
+    named: str = ""
     mask: Path | None = None
     factor: float = 1.0
     alpha_of: Path | None = None
@@ -126,7 +128,7 @@ def read_captures(
     """
     shots = read_shots(path, masks=masks, exposure=exposure, pictures=pictures)
     names = [shot.camera.name for shot in shots]
-    rig = tuple(() for _ in names) if lights == "unknown" else _lights(_home(path), lights, names)
+    rig = tuple(() for _ in names) if lights == "unknown" else _lights(home_of(path), lights, names)
 
     @lru_cache(maxsize=KEPT)
     def load(k: int) -> Loaded:
@@ -146,7 +148,7 @@ def read_shots(
     pictures: Path | None = None,
 ) -> tuple[CapturedPicture, ...]:
     """The pictures of a folder with cameras, masks and exposures; sizes are checked, see `read_captures`."""
-    kind, file = _source(Path(path))
+    kind, file = source_of(Path(path))
     elsewhere = None if pictures is None else picture_folder(Path(pictures))
     if kind == "camera.json":
         shots = [_own(file, camera, entry, elsewhere) for camera, entry in read_entries(file)]
@@ -168,8 +170,7 @@ def read_shots(
         homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
         named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
         shots = [_shot(frame, place(frame.picture), mask) for frame, mask in zip(frames, named, strict=True)]
-    if elsewhere is not None:
-        check_different({shot.camera.name: shot.picture for shot in shots}, elsewhere)
+    check_different({shot.camera.name: shot.picture for shot in shots}, elsewhere or home_of(Path(path)))
     factors = _factors(exposure, [shot.camera.name for shot in shots])
     result = []
     for shot, factor in zip(shots, factors, strict=True):
@@ -179,48 +180,18 @@ def read_shots(
     return tuple(result)
 
 
-def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ...]:
-    """Sentences about the interpretation of the pictures and cameras of `read_shots`."""
-    notes = []
-    tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
-    if any(tagged):
-        done = (
-            "It was ignored: COLMAP models and transforms.json describe the pixels as they are stored."
-            if shots[0].pixels == "stored"
-            else "They were turned upright: camera.json describes upright pictures."
-        )
-        notes.append(
-            f"Files with an EXIF orientation: {tagged[0]} pictures, {tagged[1]} masks (of {len(shots)} views). {done}"
-        )
-    raw = sum(shot.picture.suffix.lower() in RAW for shot in shots)
-    if raw:
-        notes.append(f"{raw} RAW pictures were developed linearly, with the white balance of daylight.")
-    unused = _home(Path(path)) / "masks"
-    if unused.is_dir() and not any(shot.mask for shot in shots):
-        notes.append(f"The folder {unused} was not used; --masks {unused} hands it in.")
-    kind, file = _source(Path(path))
-    if kind == "transforms":
-        applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
-        if applied:
-            notes.append(
-                f"{' and '.join(applied)} of {file.name} were inverted: the cameras are in the space of the "
-                "reconstruction. A mesh in nerfstudio's own space needs --align."
-            )
-    return tuple(notes)
-
-
 def camera_space(path: Path) -> Literal["working", "own"]:
     """ "working": the cameras are in the working space, around the mesh in its bounding sphere of radius 1
     (camera.json, and a transforms.json of ours). "own": they are in the mesh's own units, or in a space that alignment
     must find."""
-    kind, file = _source(Path(path))
+    kind, file = source_of(Path(path))
     ours = kind == "camera.json" or (kind == "transforms" and read_json(file).get("space") == SPACE)
     return "working" if ours else "own"
 
 
 def sparse_points(path: Path) -> SparsePoints | None:
     """The points of a COLMAP model, in the cameras' space; None for other references."""
-    kind, file = _source(Path(path))
+    kind, file = source_of(Path(path))
     return read_colmap_points(file) if kind == "colmap" else None
 
 
@@ -247,17 +218,6 @@ def inner_alpha(alpha: Float[np.ndarray, "h w"]) -> float:
 def least_alpha(inner: float, coverage: float = WHOLE) -> float:
     """The least alpha of a valid pixel: `coverage`, or BELOW the median `inner` of a matte that never reaches it."""
     return inner - BELOW if MATTE <= inner < coverage else coverage
-
-
-def matte_note(inner: Sequence[float]) -> tuple[str, ...]:
-    """A sentence about the mattes among the alphas with these medians; none without any."""
-    mattes = [value for value in inner if least_alpha(value) < WHOLE]
-    if not mattes:
-        return ()
-    return (
-        f"The alpha of {len(mattes)} pictures stays below 1 inside the object (medians {min(mattes):.3f} to "
-        f"{max(mattes):.3f}), as mattes of background removers do: pixels count down to {BELOW:g} below the median.",
-    )
 
 
 def silhouette(shot: CapturedPicture, seen: Callable[[float], None] = lambda inner: None) -> Bool[np.ndarray, "h w"]:
@@ -315,7 +275,7 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
     return tuple(notes)
 
 
-def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm", "metashape"], Path]:
+def source_of(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm", "metashape"], Path]:
     """The kind of references at `path`, and the file (COLMAP: the model's folder) with the cameras."""
     if path.is_dir():
         camera_files = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
@@ -352,7 +312,7 @@ def _is_metashape(path: Path) -> bool:
     return b"<document" in head and b"<chunk" in head
 
 
-def _home(path: Path) -> Path:
+def home_of(path: Path) -> Path:
     return Path(path) if Path(path).is_dir() else Path(path).parent
 
 
@@ -375,7 +335,7 @@ def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -
 def _shot(frame: CameraFrame, picture: Path, mask: Path | None) -> CapturedPicture:
     focal, centre, size = pinhole(frame.lens)
     camera = Camera(frame.world_from_cam, focal, centre, size, frame.name)
-    return CapturedPicture(camera, frame.lens, picture, frame.pixels, mask)
+    return CapturedPicture(camera, frame.lens, picture, frame.pixels, frame.picture, mask)
 
 
 def _checked(picture: Path, shot: CapturedPicture) -> int:

@@ -26,8 +26,9 @@ from mistyle.core.mesh import Mesh
 from mistyle.fitting.pipeline.outlines import camera_advice
 from mistyle.fitting.settings.material import ReferenceSettings
 from mistyle.io.cameras.camera_files import camera_entry, read_cameras, read_frames, transforms
-from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots, reading_notes
+from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots
 from mistyle.io.cameras.colmap import read_model
+from mistyle.io.cameras.reading_notes import reading_notes
 from mistyle.io.cameras.views import read_views
 from mistyle.io.images.write import write_exr
 from mistyle.io.read import read_picture, read_size, read_stored_size
@@ -295,6 +296,29 @@ def test_pictures_above_the_folder_are_refused_with_the_true_cause(tmp_path, kin
     (elsewhere / "v1.png").unlink()
     with pytest.raises(InputRefused, match="v1"):
         read_shots(home, pictures=elsewhere)
+
+
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"camera.json"}))
+@pytest.mark.parametrize("where", ["/home/someone/job/", "C:\\job\\", "../job/", "data/job/"])
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_pictures_of_files_that_were_made_elsewhere(tmp_path, kind, where, ending):
+    """Paths of another machine or folder, and pictures whose background was removed, which changed their ending."""
+    home = tmp_path / "model"
+    KINDS[kind][0](home, cameras(2), [f"{where}shots/v{k}.png" for k in range(2)])
+    folder = home / "images" if kind.startswith("colmap") else home
+    for k in range(3):
+        save(folder / "shots" / f"v{k}.{ending}", quadrants())
+    shots = read_shots(home)
+    assert [shot.picture for shot in shots] == [folder / "shots" / f"v{k}.{ending}" for k in range(2)]
+    found, rest = reading_notes(home, shots)
+    assert found.startswith(f"2 of 2 pictures were found by the end of their names (v0.{ending} for {where}")
+    assert rest.startswith("1 pictures in ") and rest.endswith(f"left out, such as v2.{ending}.")
+    save(folder / "shots" / f"v0.{'webp' if ending == 'tif' else 'tif'}", quadrants())
+    if ending == "tif":  # which of the two is unknown
+        with pytest.raises(InputRefused, match="v0"):
+            read_shots(home)
+    else:
+        assert [shot.picture for shot in read_shots(home)] == [shot.picture for shot in shots]
 
 
 def test_names_that_become_one_are_refused(tmp_path):

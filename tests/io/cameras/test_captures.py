@@ -20,12 +20,12 @@ from mistyle.io.cameras.camera_files import camera_entry, transforms
 from mistyle.io.cameras.captures import (
     camera_space,
     check_pixels,
-    matte_note,
     read_captures,
     read_shots,
     silhouette,
     sparse_points,
 )
+from mistyle.io.cameras.reading_notes import matte_note
 from mistyle.io.cameras.views import write_views
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.read import read_size
