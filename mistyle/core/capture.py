@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -80,6 +81,11 @@ def shrunk(captures: Captures, by: Sequence[int]) -> Captures:
 def shrunk_to(captures: Captures, side: int) -> Captures:
     """The pictures averaged to at most `side` pixels along their longer side."""
     return shrunk(captures, [-(-max(camera.size) // side) for camera in captures.cameras])
+
+
+def held(captures: Captures) -> Captures:
+    """The captures with every picture loaded once and kept in memory: for small ones that are loaded repeatedly."""
+    return replace(captures, load=cache(captures.load))
 
 
 def evenly_lit(captures: Captures) -> Captures:

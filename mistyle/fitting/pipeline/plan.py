@@ -73,7 +73,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": cameras_seconds(job, shots, sizes) + first_asset_seconds(len(sizes), texels, read),
         **({"photometry": 8 + PER_MATCHED * len(sizes) + read} if matched else {}),
-        **({"exposures": 5 + PER_EXPLAINED * len(sizes) + LIGHT_SECONDS * unknown} if matched else {}),
+        **({"exposures": explaining_seconds(len(sizes), read, unknown)} if matched else {}),
         "pictures": read,
         **({"light": LEFT_LIGHT if matched else LIGHT_SECONDS} if unknown else {}),
         "recover": recover_seconds(s, averaged, covered, soft, visible),
@@ -91,6 +91,15 @@ def plan_material(job: Any) -> dict[str, Any]:
         "peaks_gb": peaks(needs_of(s, sizes, *size), material_counts(s, sizes, *size)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + stored) / 1e9, 2),
     }
+
+
+def explaining_seconds(count: int, read: float, unknown: bool) -> float:
+    """Seconds of explaining the exposures of `count` pictures, all of which take `read` seconds to be read; for the
+    light a share of them is read too."""
+    from mistyle.fitting.light.unknown_light import PICTURES
+
+    lit = LIGHT_SECONDS + min(1, PICTURES / count) * read if unknown else 0
+    return 5 + PER_EXPLAINED * count + read + lit
 
 
 def first_asset_seconds(count: int, texels: float, read: float) -> float:

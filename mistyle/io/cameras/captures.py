@@ -156,10 +156,7 @@ def read_shots(
         folder = _pictures_folder(kind, Path(path), file) if elsewhere is None else elsewhere
 
         def place(name: str) -> Path:
-            if elsewhere is None and kind != "sfm":
-                return find(folder, name, file)
-            # Meshroom names pictures by where they lay on the machine of the reconstruction.
-            return find_elsewhere(folder, name)
+            return find(folder, name, file) if elsewhere is None else find_elsewhere(folder, name)
 
         def size(name: str) -> tuple[int, int]:
             return read_size(place(name), "stored")

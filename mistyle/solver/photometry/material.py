@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, shrunk_to
+from mistyle.core.capture import Captures, held, shrunk_to
 from mistyle.core.light import has_soft
 from mistyle.core.rows import weighted_median, weighted_medians
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
@@ -115,7 +115,7 @@ def material_samples(
 ) -> MaterialSamples:
     """The observations of a coarse atlas in small pictures."""
     mesh = traced.mesh
-    small = shrunk_to(captures, SIDE)
+    small = held(shrunk_to(captures, SIDE))
     options = ObservationOptions(FACING, *NOISY, skies=False, move=0)
     most = max(OBSERVATIONS, LEAST_EACH * len(captures))
     texels, observed = coarse_observations(traced, small, tangents, options, ATLAS, most)
