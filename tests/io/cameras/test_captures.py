@@ -358,9 +358,11 @@ def test_a_distorted_transforms_json(tmp_path):
     encoded = scene((pixel_centres(seen.size) - np.asarray(seen.centre)) / seen.focal)
     # The picture is linearised before it is resampled.
     assert counts.mean() > 0.9 and np.abs(rgb - linear_from_srgb(encoded))[counts].max() < 0.01
-    for change, reason in (({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"), ({"k4": 0.1}, "k4")):
+    (tmp_path / "transforms.json").write_text(json.dumps({**fields, "k4": 0.1, "frames": [frame]}))
+    assert read_shots(tmp_path)[0].lens.k4 == 0.1
+    for change in ({"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True, "k4": 0.1}):
         (tmp_path / "transforms.json").write_text(json.dumps({**fields, **change, "frames": [frame]}))
-        with pytest.raises(InputRefused, match=reason):
+        with pytest.raises(InputRefused, match="PINHOLE or OPENCV"):
             read_captures(tmp_path, lights="unknown")
 
 
