@@ -23,7 +23,7 @@ from mistyle.fitting.pipeline.budget import check_material, in_files
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.first_look import first_asset
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
-from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
+from mistyle.fitting.pipeline.outlines import camera_advice, report_placement, upright_note
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
 from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
@@ -256,7 +256,10 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     if np.isfinite(overlaps.overlap).any():
         mean, least = float(np.nanmean(overlaps.overlap)), float(np.nanmin(overlaps.overlap))
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}
-    return Placed(captures.cameras, captures.lights, (*notes, *warnings, *matte_note(inner)), figures, overlaps.overlap)
+    tags = [shot.orientation[0] if shot.pixels == "stored" else 1 for shot in shots]
+    up = () if ours else upright_note(captures.cameras, tags, asset.source.work_from_user[:3, :3], job.settings.read.up)
+    every = (*notes, *warnings, *matte_note(inner), *up)
+    return Placed(captures.cameras, captures.lights, every, figures, overlaps.overlap)
 
 
 def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures, placed: Placed) -> tuple[Captures, Placed]:

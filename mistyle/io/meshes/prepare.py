@@ -8,14 +8,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.asset import TURNED, Asset, Material, Source
+from mistyle.core.asset import TURNED, Asset, Material, Source, UpAxis
 from mistyle.core.image import resize
 from mistyle.core.mesh import Mesh, surface_of
 from mistyle.core.names import distinct
 from mistyle.geometry.normals import area_vectors, crease_normals, same_points, usable_normals
 from mistyle.geometry.raster import fragments
 from mistyle.geometry.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
-from mistyle.geometry.similarity import Y_FROM_Z
+from mistyle.geometry.similarity import Y_FROM
 from mistyle.geometry.unwrap import unwrap
 from mistyle.geometry.upright import lies_on_its_side
 from mistyle.geometry.uvs import Layout, Verdict, arrange, signed_areas
@@ -48,7 +48,7 @@ class _Plan:
     carried: bool = True
 
 
-def extent(raw: Raw, path: Path, uv: UnwrapMode, up: Literal["y", "z"], size: int) -> Extent:
+def extent(raw: Raw, path: Path, uv: UnwrapMode, up: UpAxis, size: int) -> Extent:
     """The size of `prepare`'s result, without unwrapping; refuses the same files."""
     check_positions(raw.positions, path)
     raw = plain_lookups(raw)
@@ -96,9 +96,7 @@ def _one_colour(colours: Float[np.ndarray, "f 3 c"]) -> bool:
     return bool(np.ptp(colours, axis=(0, 1)).max() < ONE_COLOUR)
 
 
-def prepare(
-    raw: Raw, path: Path, uv: UnwrapMode, up: Literal["y", "z"], size: int, progress: Callable[[float], None]
-) -> Asset:
+def prepare(raw: Raw, path: Path, uv: UnwrapMode, up: UpAxis, size: int, progress: Callable[[float], None]) -> Asset:
     """Choose UVs, unwrap where needed, and convert the mesh to the working space. `size` is the atlas size for the
     padding in texels."""
     check_positions(raw.positions, path)
@@ -113,7 +111,7 @@ def prepare(
             path, f"{len(area)} faces, all without area", "at least one triangle with an area", "Export the mesh again"
         )
     points = same_points(raw.positions)
-    notes = list(raw.notes) + ([f"The mesh was {TURNED}, as requested."] if up == "z" else [])
+    notes = list(raw.notes) + ([f"The mesh was turned from {up.upper()}{TURNED}, as requested."] if up != "y" else [])
     if up == "y" and lies_on_its_side(raw.positions, raw.faces):
         notes.append(SIDEWAYS)
     normals = _normals(raw, work, points, work_from_user, notes)
@@ -152,10 +150,10 @@ def prepare(
     return Asset(name=path.stem, mesh=mesh, materials=tuple(materials), source=source)
 
 
-def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
-    """Turns Z up to Y up if requested, and maps the bounding sphere to the unit sphere. The sphere is centred on the
+def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: UpAxis) -> Float[np.ndarray, "4 4"]:
+    """Turns the axis that points up to Y, and maps the bounding sphere to the unit sphere. The sphere is centred on the
     box of vertices of non-degenerate faces."""
-    turn = Y_FROM_Z if up == "z" else np.eye(3)
+    turn = Y_FROM[up]
     used = raw.positions[np.unique(raw.faces[has_area] if has_area.any() else raw.faces)] @ turn.T
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = float(np.linalg.norm(used - centre, axis=1).max())

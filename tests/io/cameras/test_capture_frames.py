@@ -18,13 +18,14 @@ from scipy.spatial.transform import Rotation
 from test_colmap import Model, write_bin, write_txt
 from test_read_pictures import png16
 
-from mistyle.core.asset import Pixels
+from mistyle.core.asset import Pixels, UpAxis
 from mistyle.core.camera import Camera, orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.mesh import Mesh
-from mistyle.fitting.pipeline.outlines import camera_advice
+from mistyle.fitting.pipeline.outlines import UPWARDS, camera_advice, upright_note
 from mistyle.fitting.settings.material import ReferenceSettings
+from mistyle.geometry.similarity import Y_FROM, moved_camera, similarity
 from mistyle.io.cameras.camera_files import camera_entry, read_cameras, read_frames, transforms
 from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots
 from mistyle.io.cameras.colmap import read_model
@@ -553,6 +554,28 @@ def test_outlines_that_do_not_show_a_turn_are_said():
     (note,) = overlap_notes(["a", "b", "c"], found, 0.8, "")
     assert "do not show whether the frame is the right one" in note and note.count("degrees") == 3
     assert overlap_notes(["a", "b", "c"], found, 0.8, "", trusted=True) == ()
+
+
+@pytest.mark.parametrize("up", get_args(UpAxis))
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_cameras_show_which_axis_of_a_mesh_points_up(up, tag):
+    """COLMAP's world often has Y down. People hold cameras upright, whatever their pictures' EXIF orientation is."""
+    turn = Y_FROM[up].T  # the file's axes from an upright world
+    x, y = UPWARDS[tag - 1]
+    stored = np.eye(4)
+    stored[:2, :2] = [[-y, x], [-x, -y]]  # turns upwards of the stored pixels to upwards of the camera
+
+    def seen(elevation: float) -> tuple[str, ...]:
+        ring = [orbit(40.0 * k, elevation, distance=4.0, fov=30.0, size=(8, 8)) for k in range(9)]
+        cameras = [moved_camera(camera, similarity(1.0, turn, np.zeros(3))) for camera in ring]
+        cameras = [replace(camera, world_from_cam=camera.world_from_cam @ stored) for camera in cameras]
+        return upright_note(cameras, [tag] * 9, np.eye(3) * 0.2, "y")
+
+    notes = seen(30.0)
+    assert len(notes) == (up != "y") and all(f"by the cameras {up.upper()} of its file" in note for note in notes)
+    assert seen(80.0) == ()  # from above, upwards is anywhere
+    ring = [orbit(40.0 * k, 30.0, distance=4.0, fov=30.0, size=(8, 8)) for k in range(9)]
+    assert upright_note(ring, [1] * 9, Y_FROM[up] * 3, up) == ()
 
 
 def test_pictures_without_an_outline_are_not_judged():
