@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -81,11 +80,6 @@ def shrunk(captures: Captures, by: Sequence[int]) -> Captures:
 def shrunk_to(captures: Captures, side: int) -> Captures:
     """The pictures averaged to at most `side` pixels along their longer side."""
     return shrunk(captures, [-(-max(camera.size) // side) for camera in captures.cameras])
-
-
-def held(captures: Captures) -> Captures:
-    """The captures with every picture loaded once and kept in memory: for small ones that are loaded repeatedly."""
-    return replace(captures, load=cache(captures.load))
 
 
 def evenly_lit(captures: Captures) -> Captures:

@@ -7,8 +7,8 @@ r² = x² + y²,
     y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p1 (r² + 2 y²) + 2 p2 x y
     pixel = (fx x' + skew y' + cx, fy y' + cy)
 
-in the pixel convention of core/camera.py. Only Metashape and nerfstudio know k4, and only Metashape a skew. The model
-holds as far as its radial part rises; beyond, it folds back.
+in the pixel convention of core/camera.py. Metashape has k4 and skew, nerfstudio k4. The model holds as far as its
+radial part rises; beyond, it folds back.
 """
 
 from dataclasses import dataclass
@@ -68,14 +68,9 @@ def distort(lens: Lens, tangents: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray
     (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * lens.k4)))
-    distorted = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-    return np.where((r2 < _reach(lens))[..., None], distorted, np.nan)
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.where((r2 < _reach(lens))[..., None], np.stack([across, down], axis=-1), np.nan)
 
 
 def px_in_photograph(lens: Lens, px: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
@@ -83,8 +78,7 @@ def px_in_photograph(lens: Lens, px: Float[np.ndarray, "*n 2"]) -> Float[np.ndar
     radius."""
     focal, centre, _ = pinhole(lens)
     bent = distort(lens, (px - np.asarray(centre)) / focal)
-    sheared = bent[..., 1:] * np.array([lens.skew, 0.0])
-    return bent * np.asarray(lens.focal) + sheared + np.asarray(lens.centre)
+    return bent * lens.focal + bent[..., 1:] * (lens.skew, 0.0) + np.asarray(lens.centre)
 
 
 def resample(
@@ -114,7 +108,6 @@ def resample(
 def _reach(lens: Lens) -> float:
     """The square of the radius up to which r (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) rises."""
     k1, k2, k3 = lens.radial
-    bent = any((*lens.radial, lens.k4))
-    roots = np.roots([9 * lens.k4, 7 * k3, 5 * k2, 3 * k1, 1.0]) if bent else np.zeros(0)
+    roots = np.roots([9 * lens.k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
     rising = [float(root.real) for root in roots if abs(root.imag) < 1e-9 * max(abs(root), 1) and root.real > 0]
     return min(rising, default=np.inf)

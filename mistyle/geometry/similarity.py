@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mistyle.core.asset import UpAxis
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures
 from mistyle.core.light import (
@@ -26,10 +25,6 @@ from mistyle.core.light import (
 )
 
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
-# Rotations about X that turn a file's upward axis to Y.
-Y_FROM: dict[UpAxis, Float[np.ndarray, "3 3"]] = {
-    "y": np.eye(3), "z": Y_FROM_Z, "-y": np.diag([1.0, -1.0, -1.0]), "-z": Y_FROM_Z.T,
-}  # fmt: skip
 
 
 def similarity(

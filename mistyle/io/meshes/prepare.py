@@ -15,7 +15,7 @@ from mistyle.core.names import distinct
 from mistyle.geometry.normals import area_vectors, crease_normals, same_points, usable_normals
 from mistyle.geometry.raster import fragments
 from mistyle.geometry.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
-from mistyle.geometry.similarity import Y_FROM
+from mistyle.geometry.similarity import Y_FROM_Z
 from mistyle.geometry.unwrap import unwrap
 from mistyle.geometry.upright import lies_on_its_side
 from mistyle.geometry.uvs import Layout, Verdict, arrange, signed_areas
@@ -34,6 +34,10 @@ FACE_TEXELS = 64  # of a palette's face after resampling
 SIDEWAYS = (
     "The mesh seems to lie on its side: it is tallest along z, with its base at the lower end. --up z turns it upright."
 )
+# Rotations about X that turn a file's upward axis to Y.
+Y_FROM: dict[UpAxis, Float[np.ndarray, "3 3"]] = {
+    "y": np.eye(3), "z": Y_FROM_Z, "-y": np.diag([1.0, -1.0, -1.0]), "-z": Y_FROM_Z.T,
+}  # fmt: skip
 UnwrapMode = Literal["keep", "new", "auto"]
 
 

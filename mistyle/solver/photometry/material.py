@@ -16,13 +16,14 @@ with the median residual, so that priors keep the texels plain and the gains exp
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 
 from mistyle.core.camera import Camera
-from mistyle.core.capture import Captures, held, shrunk_to
+from mistyle.core.capture import Captures, shrunk_to
 from mistyle.core.light import has_soft
 from mistyle.core.rows import weighted_median, weighted_medians
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
@@ -115,7 +116,8 @@ def material_samples(
 ) -> MaterialSamples:
     """The observations of a coarse atlas in small pictures."""
     mesh = traced.mesh
-    small = held(shrunk_to(captures, SIDE))
+    small = shrunk_to(captures, SIDE)
+    small = replace(small, load=cache(small.load))  # observed twice, and photographs are slow to decode
     options = ObservationOptions(FACING, *NOISY, skies=False, move=0)
     most = max(OBSERVATIONS, LEAST_EACH * len(captures))
     texels, observed = coarse_observations(traced, small, tangents, options, ATLAS, most)

@@ -25,13 +25,14 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.core.mesh import Mesh
 from mistyle.fitting.pipeline.outlines import UPWARDS, camera_advice, upright_note
 from mistyle.fitting.settings.material import ReferenceSettings
-from mistyle.geometry.similarity import Y_FROM, moved_camera, similarity
+from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.io.cameras.camera_files import camera_entry, read_cameras, read_frames, transforms
 from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots
 from mistyle.io.cameras.colmap import read_model
 from mistyle.io.cameras.reading_notes import reading_notes
 from mistyle.io.cameras.views import read_views
 from mistyle.io.images.write import write_exr
+from mistyle.io.meshes.prepare import Y_FROM
 from mistyle.io.read import read_picture, read_size, read_stored_size
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.solver.cameras.outline_check import Outlines, check_outlines, overlap_line, overlap_notes
