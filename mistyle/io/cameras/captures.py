@@ -36,6 +36,7 @@ from mistyle.core.light import Lights, lights_of_views
 from mistyle.geometry.lens import Lens, pinhole, resample
 from mistyle.io.cameras.camera_files import PIXELS, SPACE, CameraFrame, ViewEntry, read_entries, read_frames
 from mistyle.io.cameras.colmap import SparsePoints, find_model
+from mistyle.io.cameras.foreign import foreign_files, foreign_kind
 from mistyle.io.cameras.picture_files import (
     COPY,
     HAND_IN,
@@ -282,16 +283,22 @@ def source_of(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap"
             camera_files += [file for file in sorted(path.glob("*.xml")) if _is_metashape(file)]
         if not camera_files and model is not None:
             return "colmap", model
-        if not camera_files:
-            raise refuse(path, "neither of these in the folder", EXPECTED, "Hand in the folder with the cameras")
-        path = camera_files[0]
+        foreign = [] if camera_files else foreign_files(path)[:1]
+        if not camera_files and not foreign:
+            raise refuse(path, "none of these in the folder", EXPECTED, "Hand in the folder with the cameras")
+        path = (camera_files or foreign)[0]
     elif not path.is_file():
         raise refuse(path, "nothing", EXPECTED, "Check the path")
     if path.suffix.lower() == ".xml" and _is_metashape(path):
         return "metashape", path
+    foreign = foreign_kind(path)
+    if foreign is not None:
+        raise refuse(path, foreign[0], EXPECTED, foreign[1])
     if path.suffix.lower() not in (".json", ".sfm"):
         raise refuse(path, f"a file ending in '{path.suffix}'", EXPECTED, "Hand in the folder with the cameras")
     tree = read_json(path)
+    if not {"frames", "views"} & set(tree):
+        raise refuse(path, f"an object of {', '.join(sorted(tree))[:100] or 'nothing'}", EXPECTED, "Check the file")
     return ("sfm" if is_sfm(tree) else "transforms" if "frames" in tree else "camera.json"), path
 
 
