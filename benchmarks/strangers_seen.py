@@ -18,7 +18,8 @@ from benchmarks.common import PROGRAM
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.core.image import srgb_from_linear
-from mistyle.io.cameras.captures import read_captures, read_shots, reading_notes
+from mistyle.io.cameras.captures import read_captures, read_shots
+from mistyle.io.cameras.reading_notes import reading_notes
 from mistyle.io.read import read_frame, read_picture
 from mistyle.io.read_mesh import MESHES, read_mesh
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.asset import Asset
+from mistyle.core.asset import Asset, UpAxis
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures
 from mistyle.core.light import Lights
@@ -19,7 +19,7 @@ def read_mesh(
     path: str | PathLike,
     *,
     uv: Literal["keep", "new", "auto"] = "auto",
-    up: Literal["y", "z"] = "y",
+    up: UpAxis = "y",
     size: int = 2048,
     max_faces: int = 5_000_000,
 ) -> Asset:
@@ -29,7 +29,7 @@ def read_mesh(
     the origin; `asset.source.work_from_user` (4, 4) is that transform. The order of vertices and faces stays.
 
     uv         "auto" unwraps materials without usable UVs; "keep" refuses those; "new" unwraps every material
-    up         "z" rotates a mesh with Z up
+    up         the axis of the file that points up; other than "y", the mesh is rotated
     size       texels a side of the atlas of a new unwrapping
     max_faces  larger meshes are refused
 

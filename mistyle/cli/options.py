@@ -218,7 +218,8 @@ def add_mesh_options(verb: argparse.ArgumentParser) -> None:
         choices=["auto", "keep", "new"],
         help="authored UVs: keep, replace, or (auto) replace only where unusable",
     )
-    verb.add_argument("--up", choices=["y", "z"], help="the up axis of the mesh file (default y)")
+    axes = ["y", "z", "-y", "-z"]
+    verb.add_argument("--up", choices=axes, help="the up axis of the mesh file (default y; --up=-y for Y down)")
     verb.add_argument("--lit", action="store_const", const=True, help="turn unlit glTF materials into lit ones")
 
 

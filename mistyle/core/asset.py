@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from mistyle.core.mesh import Mesh
 
-TURNED = "turned from Z up to Y up"  # part of the note of every mesh that reading has turned
+UpAxis = Literal["y", "z", "-y", "-z"]  # of a file, that points up
+TURNED = " up to Y up"  # part of the note of every mesh that reading has turned
 # Rows and columns as the file stores them, or as a viewer shows the picture (EXIF orientation).
 Pixels = Literal["stored", "upright"]
 # Endings of cameras' RAW files.

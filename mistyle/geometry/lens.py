@@ -3,11 +3,12 @@
 Brown's model as OpenCV, COLMAP and transforms.json write it. With x, y = tangents in the camera (x right, y down) and
 r² = x² + y²,
 
-    x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
-    y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2 y²) + 2 p2 x y
-    pixel = (fx x' + cx, fy y' + cy)
+    x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + 2 p1 x y + p2 (r² + 2 x²)
+    y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p1 (r² + 2 y²) + 2 p2 x y
+    pixel = (fx x' + skew y' + cx, fy y' + cy)
 
-in the pixel convention of core/camera.py. The model holds as far as its radial part rises; beyond, it folds back.
+in the pixel convention of core/camera.py. Metashape has k4 and skew, nerfstudio k4. The model holds as far as its
+radial part rises; beyond, it folds back.
 """
 
 from dataclasses import dataclass
@@ -26,23 +27,25 @@ ROWS = 256  # of a picture at a time, to bound the memory for the coordinates of
 @dataclass(frozen=True)
 class Lens:
     """The map from tangents to a photograph's pixels: `focal` (x, y) and `centre` in pixels, `size` (height, width),
-    `radial` k1 k2 k3 and `tangential` p1 p2 without unit."""
+    `radial` k1 k2 k3, `k4` and `tangential` p1 p2 without unit, `skew` in pixels."""
 
     focal: tuple[float, float]
     centre: tuple[float, float]
     size: tuple[int, int]
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
+    k4: float = 0.0
+    skew: float = 0.0
 
 
 def is_distorted(lens: Lens) -> bool:
     """Whether straight lines appear curved."""
-    return any(lens.radial) or any(lens.tangential)
+    return any((*lens.radial, *lens.tangential, lens.k4))
 
 
 def is_pinhole(lens: Lens) -> bool:
-    """Whether core/camera.py's Camera describes the photograph: no distortion, square pixels."""
-    return not is_distorted(lens) and abs(lens.focal[0] - lens.focal[1]) <= SQUARE * lens.focal[0]
+    """Whether core/camera.py's Camera describes the photograph: no distortion or skew, square pixels."""
+    return not (is_distorted(lens) or lens.skew) and abs(lens.focal[0] - lens.focal[1]) <= SQUARE * lens.focal[0]
 
 
 def pinhole(lens: Lens) -> tuple[float, tuple[float, float], tuple[int, int]]:
@@ -64,22 +67,18 @@ def distort(lens: Lens, tangents: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray
     x, y = np.moveaxis(np.asarray(tangents, float), -1, 0)
     (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    distorted = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-    return np.where((r2 < _reach(lens))[..., None], distorted, np.nan)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * lens.k4)))
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    down = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.where((r2 < _reach(lens))[..., None], np.stack([across, down], axis=-1), np.nan)
 
 
 def px_in_photograph(lens: Lens, px: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
     """Pixel coordinates in the photograph of pixel coordinates of its `pinhole`; NaN outside the model's valid
     radius."""
     focal, centre, _ = pinhole(lens)
-    return distort(lens, (px - np.asarray(centre)) / focal) * np.asarray(lens.focal) + np.asarray(lens.centre)
+    bent = distort(lens, (px - np.asarray(centre)) / focal)
+    return bent * lens.focal + bent[..., 1:] * (lens.skew, 0.0) + np.asarray(lens.centre)
 
 
 def resample(
@@ -107,8 +106,8 @@ def resample(
 
 
 def _reach(lens: Lens) -> float:
-    """The square of the radius up to which r (1 + k1 r² + k2 r⁴ + k3 r⁶) rises."""
+    """The square of the radius up to which r (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) rises."""
     k1, k2, k3 = lens.radial
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0]) if any(lens.radial) else np.zeros(0)
+    roots = np.roots([9 * lens.k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
     rising = [float(root.real) for root in roots if abs(root.imag) < 1e-9 * max(abs(root), 1) and root.real > 0]
     return min(rising, default=np.inf)

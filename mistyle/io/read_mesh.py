@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.asset import Asset
+from mistyle.core.asset import Asset, UpAxis
 from mistyle.io.meshes.parsed_mesh import Extent, Raw, spelled
 from mistyle.io.sandbox.bounds import refuse
 from mistyle.io.sandbox.reader_process import ask
@@ -45,7 +45,7 @@ def read_mesh(
     path: Path,
     *,
     uv: Literal["keep", "new", "auto"] = "auto",
-    up: Literal["y", "z"] = "y",
+    up: UpAxis = "y",
     max_faces: int = 5_000_000,
     size: int = 2048,
     lit: bool = False,
@@ -55,7 +55,7 @@ def read_mesh(
 
     uv        "auto" keeps authored UVs where they can be painted and unwraps the materials with none or unusable ones;
               "keep" refuses those; "new" unwraps every material
-    up        "z" turns a mesh modelled with Z up
+    up        the axis of the file that points up; other than "y", the mesh is turned
     max_faces refuses larger meshes (and more than three times as many vertices)
     size      the atlas size for the padding of a new unwrapping
     lit       a glTF result drops KHR_materials_unlit from its painted materials
@@ -92,7 +92,7 @@ def read_extent(
     path: Path,
     *,
     uv: Literal["keep", "new", "auto"] = "auto",
-    up: Literal["y", "z"] = "y",
+    up: UpAxis = "y",
     max_faces: int = 5_000_000,
     size: int = 2048,
 ) -> Extent:

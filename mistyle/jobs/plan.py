@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
+from mistyle.core.asset import UpAxis
 from mistyle.io.meshes.parsed_mesh import Extent
 from mistyle.jobs.inputs import input_files
 from mistyle.jobs.memory_budget import Counts, Need, must_tile, peaks, within_gb
@@ -44,7 +45,7 @@ def extent_of(mesh: Path, settings: Any) -> Extent:
 
 @lru_cache(maxsize=64)  # a batch names few meshes many times
 def _extent(
-    mesh: Path, uv: Literal["keep", "new", "auto"], up: Literal["y", "z"], max_faces: int, size: int, stamps: object
+    mesh: Path, uv: Literal["keep", "new", "auto"], up: UpAxis, max_faces: int, size: int, stamps: object
 ) -> Extent:
     """`stamps` makes a changed file a new key of the cache."""
     from mistyle.io.read_mesh import read_extent

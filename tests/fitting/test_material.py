@@ -179,7 +179,7 @@ def test_cameras_that_do_not_fit_the_mesh_are_said(shots, tmp_path, capsys, monk
     printed = capsys.readouterr().err
     assert note in printed and f"c00_0 {wrong.overlap[0]:.2f}, " in printed
     blind = [replace(shot, picture=shot.picture.with_suffix(".png"), alpha_of=None) for shot in read]
-    monkeypatch.setattr("mistyle.io.cameras.captures.outline_of", lambda shot: None)
+    monkeypatch.setattr("mistyle.io.cameras.captures.outline_of", lambda shot, seen: None)
     if not align:
         (note,) = place(job, asset, captures, blind, lambda done: None).notes
         assert "not checked whether the cameras fit" in note

@@ -13,6 +13,7 @@ from mistyle.core.capture import in_memory
 from mistyle.core.image import gaussian
 from mistyle.core.light import Environment
 from mistyle.core.maps import flat_maps
+from mistyle.fitting.pipeline.plan import explaining_seconds
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
@@ -77,6 +78,23 @@ def test_the_reduced_system_is_that_of_the_model(glossy):
         costs.append(work.cost(work.texels(values, 60)))
     assert (costs[1] - costs[0]) / 2 == pytest.approx(-2 * system.gradient @ step, rel=0.15)
     assert np.linalg.eigvalsh(system.matrix)[0] > -1e-6 * np.trace(system.matrix)
+
+
+def test_pictures_are_decoded_once(glossy, monkeypatch):
+    """Also where the coarse atlas is laid out twice: decoding photographs takes longer than all else."""
+    traced, captures = glossy
+    loaded: list[int] = []
+
+    def load(k: int):
+        loaded.append(k)
+        return captures.load(k)
+
+    monkeypatch.setattr(material, "OBSERVATIONS", 2000)
+    monkeypatch.setattr(material, "LEAST_EACH", 50)
+    material.material_samples(traced, replace(captures, load=load), None)
+    assert sorted(loaded) == list(range(VIEWS))
+    with_sky = explaining_seconds(80, 40.0, unknown=True) - explaining_seconds(80, 0.0, unknown=True)
+    assert with_sky == pytest.approx(40 + 40 * 48 / 80) and explaining_seconds(9, 7.0, unknown=False) > 7
 
 
 def test_exposures_of_metal_and_dark_gloss_are_found(glossy):

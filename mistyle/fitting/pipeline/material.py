@@ -23,7 +23,7 @@ from mistyle.fitting.pipeline.budget import check_material, in_files
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.first_look import first_asset
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
-from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
+from mistyle.fitting.pipeline.outlines import camera_advice, report_placement, upright_note
 from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
 from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
@@ -96,7 +96,8 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     from mistyle.deliver.colour import in_working_space, key_of
     from mistyle.deliver.export import check, deliver
     from mistyle.fitting.report.material import material_report, write_summary
-    from mistyle.io.cameras.captures import read_shots, reading_notes
+    from mistyle.io.cameras.captures import read_shots
+    from mistyle.io.cameras.reading_notes import reading_notes
     from mistyle.jobs.run_record import old_report
 
     files = input_files(job.mesh)
@@ -211,6 +212,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     the overlap of the mesh's outlines with the masks."""
     from mistyle.geometry.similarity import moved, upright
     from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
+    from mistyle.io.cameras.reading_notes import matte_note
     from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
     from mistyle.solver.cameras.outline_check import check_outlines, overlap_notes
 
@@ -218,10 +220,11 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     captures = upright(captures) if chosen.up == "z" else captures
     figures: dict[str, float] = {}
     notes: list[str] = []
+    inner: list[float] = []
     masks, sparse = None, sparse_points(job.references) if chosen.align else None
     if chosen.align or chosen.refine_poses:
         try:
-            masks = [silhouette(shot) for shot in shots]
+            masks = [silhouette(shot, inner.append) for shot in shots]
         except InputRefused:
             if sparse is None or chosen.refine_poses or job.masks is not None:
                 raise
@@ -238,7 +241,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     elif camera_space(job.references) == "own":
         captures = moved(captures, asset.source.work_from_user)
     report(0.3)
-    outlines = (outline_of(shot) for shot in shots) if masks is None else masks
+    outlines = (outline_of(shot, inner.append) for shot in shots) if masks is None else masks
     if chosen.refine_poses:
         refined = refine_poses(
             asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.3 + 0.5 * done)
@@ -253,7 +256,10 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     if np.isfinite(overlaps.overlap).any():
         mean, least = float(np.nanmean(overlaps.overlap)), float(np.nanmin(overlaps.overlap))
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}
-    return Placed(captures.cameras, captures.lights, (*notes, *warnings), figures, overlaps.overlap)
+    tags = [shot.orientation[0] if shot.pixels == "stored" else 1 for shot in shots]
+    up = () if ours else upright_note(captures.cameras, tags, asset.source.work_from_user[:3, :3], job.settings.read.up)
+    every = (*notes, *warnings, *matte_note(inner), *up)
+    return Placed(captures.cameras, captures.lights, every, figures, overlaps.overlap)
 
 
 def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures, placed: Placed) -> tuple[Captures, Placed]:

@@ -73,7 +73,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": cameras_seconds(job, shots, sizes) + first_asset_seconds(len(sizes), texels, read),
         **({"photometry": 8 + PER_MATCHED * len(sizes) + read} if matched else {}),
-        **({"exposures": 5 + PER_EXPLAINED * len(sizes) + LIGHT_SECONDS * unknown} if matched else {}),
+        **({"exposures": explaining_seconds(len(sizes), read, unknown)} if matched else {}),
         "pictures": read,
         **({"light": LEFT_LIGHT if matched else LIGHT_SECONDS} if unknown else {}),
         "recover": recover_seconds(s, averaged, covered, soft, visible),
@@ -93,14 +93,25 @@ def plan_material(job: Any) -> dict[str, Any]:
     }
 
 
+def explaining_seconds(count: int, read: float, unknown: bool) -> float:
+    """Seconds of explaining the exposures of `count` pictures, all of which take `read` seconds to be read; for the
+    light a share of them is read too."""
+    from mistyle.fitting.light.unknown_light import PICTURES
+
+    lit = LIGHT_SECONDS + min(1, PICTURES / count) * read if unknown else 0
+    return 5 + PER_EXPLAINED * count + read + lit
+
+
 def first_asset_seconds(count: int, texels: float, read: float) -> float:
     """Seconds of projecting few of `count` pictures, all of which take `read` seconds to be read."""
     return 0.2 + min(1, FIRST_PICTURES / count) * read + min(texels, FIRST_TEXELS) * PER_FIRST_TEXEL
 
 
 def cameras_seconds(job: Any, shots: Sequence["CapturedPicture"], sizes: Sequence[int]) -> float:
-    """Seconds of placing the cameras: masks and alpha are read."""
-    masked = sum(n for n, shot in zip(sizes, shots, strict=True) if shot.mask is not None or shot.alpha_of is not None)
+    """Seconds of placing the cameras: masks, and pictures that can have an alpha, are read."""
+    from mistyle.io.cameras.captures import may_have_alpha
+
+    masked = sum(n for n, shot in zip(sizes, shots, strict=True) if shot.mask is not None or may_have_alpha(shot))
     aligned = ALIGNED * (job.settings.references.align + job.settings.references.refine_poses * len(sizes))
     return 0.1 + aligned + PER_OUTLINE * len(sizes) + masked * PER_READ_PIXEL
 

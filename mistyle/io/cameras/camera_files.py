@@ -176,7 +176,7 @@ def read_cameras(path: Path, size: tuple[int, int] = (1024, 1024)) -> list[Camer
 
 
 def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[CameraFrame]:
-    """The frames of a `transforms.json` with their lenses (k1 k2 k3 p1 p2), in the file's order and the space before
+    """The frames of a `transforms.json` with their lenses (k1 to k4, p1 p2), in the file's order and the space before
     nerfstudio's `applied_transform` and `applied_scale`.
 
     `size_of` returns (height, width) of the picture that a frame names, for files without (w, h). A frame's own
@@ -273,8 +273,6 @@ def _frame(
     fix = "Undistort the pictures and cameras first"
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") or fields.get("is_fisheye"):
         raise refuse(path, f"the camera model {str(model)[:80]!r} in {where}", "PINHOLE or OPENCV", fix)
-    if number("k4"):
-        raise refuse(path, f"lens distortion k4 in {where}", "at most k1 k2 k3 p1 p2", fix)
     high, wide = number("h"), number("w")
     height, width = (int(high), int(wide)) if high and wide else size_of(known.file_path)
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
@@ -287,9 +285,9 @@ def _frame(
     cx, cy = number("cx"), number("cy")
     matrix = _matrix(known.transform_matrix, where, path) @ OPENGL_FROM_OPENCV
     check_rotation(matrix[:3, :3], where, path)
-    k1, k2, k3, p1, p2 = (float(number(key) or 0.0) for key in ("k1", "k2", "k3", "p1", "p2"))
+    k1, k2, k3, k4, p1, p2 = (float(number(key) or 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     centre = (width / 2 if cx is None else float(cx), height / 2 if cy is None else float(cy))
-    lens = Lens((float(fx), float(fy)), centre, (height, width), (k1, k2, k3), (p1, p2))
+    lens = Lens((float(fx), float(fy)), centre, (height, width), (k1, k2, k3), (p1, p2), k4)
     world_from_cam = moved_camera(Camera(matrix, float(fx), centre, (height, width), name), original).world_from_cam
     return CameraFrame(name, known.file_path, known.mask_path, world_from_cam, lens, "stored")
 

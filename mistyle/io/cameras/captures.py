@@ -11,14 +11,15 @@ A camera describes either stored pixels or upright ones (EXIF orientation, see i
 `CapturedPicture.pixels`, for both the picture and the mask of a view.
 
 Valid pixels are finite, not saturated (an encoded channel at its maximum), wholly inside the alpha and inside the
-user's mask. A partly covered pixel shows the background too.
+user's mask. A partly covered pixel shows the background too. Background removers write mattes that stay just below 1
+inside the object: there the median takes the place of 1 (`least_alpha`).
 
 The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops times as bright as the radiance),
 `{"factor": {picture: factor, ...}}`, or the names and stops alone.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -35,6 +36,7 @@ from mistyle.core.light import Lights, lights_of_views
 from mistyle.geometry.lens import Lens, pinhole, resample
 from mistyle.io.cameras.camera_files import PIXELS, SPACE, CameraFrame, ViewEntry, read_entries, read_frames
 from mistyle.io.cameras.colmap import SparsePoints, find_model
+from mistyle.io.cameras.foreign import foreign_files, foreign_kind
 from mistyle.io.cameras.picture_files import (
     COPY,
     HAND_IN,
@@ -70,6 +72,10 @@ EXPECTED = (
 )
 KEPT = 2  # pictures held decoded
 TRANSFORMS = ("transforms.json", "transforms_train.json")
+OPAQUE = (".jpg", ".jpeg", *RAW)  # have no alpha, so they need not be decoded for it
+WHOLE = 0.999  # least alpha of a valid pixel of a rendered picture
+# A matte whose median inside the object is from MATTE to WHOLE; a valid pixel's alpha is at most BELOW under it.
+MATTE, BELOW = 0.95, 0.02
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,7 @@ class CapturedPicture:
     camera       the pinhole camera that it is resampled to
     lens         the lens of the photograph
     pixels       the pixels of picture and mask that these two describe (io/cameras/camera_files.py)
+    named        the picture's name in the camera file; empty for our own
     factor       the exposure factor of its radiance
     alpha_of     an EXR whose A is the alpha of a picture without its own
     orientation  the EXIF orientations 1..8 of picture and mask (1: none)
@@ -88,6 +95,7 @@ class CapturedPicture:
     lens: Lens
     picture: Path
     pixels: Pixels
+    named: str = ""
     mask: Path | None = None
     factor: float = 1.0
     alpha_of: Path | None = None
@@ -102,7 +110,7 @@ def read_captures(
     exposure: Path | Mapping[str, float] | None = None,
     pictures: Path | None = None,
     saturation: float = 1.0,
-    coverage: float = 0.999,
+    coverage: float = WHOLE,
 ) -> Captures:
     """The references of a fit, in the space of `camera_space`; headers are read now, pixels one picture at a time.
 
@@ -114,14 +122,14 @@ def read_captures(
     pictures    the folder of the pictures, where it is elsewhere; missing folders of a camera file's picture names are
                 dropped
     saturation  encoded value 0..1 at which a channel counts as saturated (JPEGs often stay below 1)
-    coverage    least alpha 0..1 of a valid pixel; its colour is unpremultiplied
+    coverage    least alpha 0..1 of a valid pixel, less for mattes (`least_alpha`); its colour is unpremultiplied
 
     Refused: cameras without pictures, pictures or masks of another size than their camera, views without lights,
     masks or exposures for some views only. `check_pixels` checks the pixel values.
     """
     shots = read_shots(path, masks=masks, exposure=exposure, pictures=pictures)
     names = [shot.camera.name for shot in shots]
-    rig = tuple(() for _ in names) if lights == "unknown" else _lights(_home(path), lights, names)
+    rig = tuple(() for _ in names) if lights == "unknown" else _lights(home_of(path), lights, names)
 
     @lru_cache(maxsize=KEPT)
     def load(k: int) -> Loaded:
@@ -141,7 +149,7 @@ def read_shots(
     pictures: Path | None = None,
 ) -> tuple[CapturedPicture, ...]:
     """The pictures of a folder with cameras, masks and exposures; sizes are checked, see `read_captures`."""
-    kind, file = _source(Path(path))
+    kind, file = source_of(Path(path))
     elsewhere = None if pictures is None else picture_folder(Path(pictures))
     if kind == "camera.json":
         shots = [_own(file, camera, entry, elsewhere) for camera, entry in read_entries(file)]
@@ -149,10 +157,7 @@ def read_shots(
         folder = _pictures_folder(kind, Path(path), file) if elsewhere is None else elsewhere
 
         def place(name: str) -> Path:
-            if elsewhere is None and kind != "sfm":
-                return find(folder, name, file)
-            # Meshroom names pictures by where they lay on the machine of the reconstruction.
-            return find_elsewhere(folder, name)
+            return find(folder, name, file) if elsewhere is None else find_elsewhere(folder, name)
 
         def size(name: str) -> tuple[int, int]:
             return read_size(place(name), "stored")
@@ -163,8 +168,7 @@ def read_shots(
         homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
         named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
         shots = [_shot(frame, place(frame.picture), mask) for frame, mask in zip(frames, named, strict=True)]
-    if elsewhere is not None:
-        check_different({shot.camera.name: shot.picture for shot in shots}, elsewhere)
+    check_different({shot.camera.name: shot.picture for shot in shots}, elsewhere or home_of(Path(path)))
     factors = _factors(exposure, [shot.camera.name for shot in shots])
     result = []
     for shot, factor in zip(shots, factors, strict=True):
@@ -174,56 +178,26 @@ def read_shots(
     return tuple(result)
 
 
-def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ...]:
-    """Sentences about the interpretation of the pictures and cameras of `read_shots`."""
-    notes = []
-    tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
-    if any(tagged):
-        done = (
-            "It was ignored: COLMAP models and transforms.json describe the pixels as they are stored."
-            if shots[0].pixels == "stored"
-            else "They were turned upright: camera.json describes upright pictures."
-        )
-        notes.append(
-            f"Files with an EXIF orientation: {tagged[0]} pictures, {tagged[1]} masks (of {len(shots)} views). {done}"
-        )
-    raw = sum(shot.picture.suffix.lower() in RAW for shot in shots)
-    if raw:
-        notes.append(f"{raw} RAW pictures were developed linearly, with the white balance of daylight.")
-    unused = _home(Path(path)) / "masks"
-    if unused.is_dir() and not any(shot.mask for shot in shots):
-        notes.append(f"The folder {unused} was not used; --masks {unused} hands it in.")
-    kind, file = _source(Path(path))
-    if kind == "transforms":
-        applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
-        if applied:
-            notes.append(
-                f"{' and '.join(applied)} of {file.name} were inverted: the cameras are in the space of the "
-                "reconstruction. A mesh in nerfstudio's own space needs --align."
-            )
-    return tuple(notes)
-
-
 def camera_space(path: Path) -> Literal["working", "own"]:
     """ "working": the cameras are in the working space, around the mesh in its bounding sphere of radius 1
     (camera.json, and a transforms.json of ours). "own": they are in the mesh's own units, or in a space that alignment
     must find."""
-    kind, file = _source(Path(path))
+    kind, file = source_of(Path(path))
     ours = kind == "camera.json" or (kind == "transforms" and read_json(file).get("space") == SPACE)
     return "working" if ours else "own"
 
 
 def sparse_points(path: Path) -> SparsePoints | None:
     """The points of a COLMAP model, in the cameras' space; None for other references."""
-    kind, file = _source(Path(path))
+    kind, file = source_of(Path(path))
     return read_colmap_points(file) if kind == "colmap" else None
 
 
-def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 0.999) -> Loaded:
+def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = WHOLE) -> Loaded:
     """Linear radiance in the shot's pinhole camera, 0 at invalid pixels, and the mask of valid pixels."""
     rgb, alpha, usable = _decoded(shot, saturation)
     if alpha is not None:
-        usable = usable & (alpha >= coverage)
+        usable = usable & (alpha >= least_alpha(inner_alpha(alpha), coverage))
         if shot.picture.suffix.lower() == ".exr":
             rgb = rgb / np.maximum(alpha, 1e-6)[..., None]
     if shot.mask is not None:
@@ -233,19 +207,33 @@ def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 
     return resample(shot.lens, rgb, usable)
 
 
-def silhouette(shot: CapturedPicture) -> Bool[np.ndarray, "h w"]:
-    """The object's mask in the pinhole camera, from the user's mask, else from the picture's alpha (at least half).
+def inner_alpha(alpha: Float[np.ndarray, "h w"]) -> float:
+    """The median alpha inside the object, where it is at least half; 1 where it is nowhere."""
+    inside = alpha[alpha >= 0.5]
+    return float(np.median(inside)) if inside.size else 1.0
+
+
+def least_alpha(inner: float, coverage: float = WHOLE) -> float:
+    """The least alpha of a valid pixel: `coverage`, or BELOW the median `inner` of a matte that never reaches it."""
+    return inner - BELOW if MATTE <= inner < coverage else coverage
+
+
+def silhouette(shot: CapturedPicture, seen: Callable[[float], None] = lambda inner: None) -> Bool[np.ndarray, "h w"]:
+    """The object's mask in the pinhole camera, from the user's mask, else from the picture's alpha (at least half);
+    `seen` is given the alpha's median (`inner_alpha`).
 
     Refused: a picture without either.
     """
-    outline = outline_of(shot)
+    outline = outline_of(shot, seen)
     if outline is None:
         fix = "Hand in masks (a folder with a picture of the same name per view)"
         raise refuse(shot.picture, "neither an alpha channel nor a mask", "to know where the object is", fix)
     return outline
 
 
-def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
+def outline_of(
+    shot: CapturedPicture, seen: Callable[[float], None] = lambda inner: None
+) -> Bool[np.ndarray, "h w"] | None:
     """As `silhouette`; None for a picture that has neither alpha nor mask."""
     if shot.mask is not None:
         covered = _inside(shot.mask, shot.pixels)
@@ -254,6 +242,7 @@ def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
         if alpha is None:
             return None
         covered = alpha >= 0.5
+        seen(inner_alpha(alpha))
     everywhere = np.ones_like(covered)
     return resample(shot.lens, covered[..., None].astype(np.float32), everywhere)[0][..., 0] >= 0.5
 
@@ -284,7 +273,7 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
     return tuple(notes)
 
 
-def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm", "metashape"], Path]:
+def source_of(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm", "metashape"], Path]:
     """The kind of references at `path`, and the file (COLMAP: the model's folder) with the cameras."""
     if path.is_dir():
         camera_files = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
@@ -294,16 +283,22 @@ def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", 
             camera_files += [file for file in sorted(path.glob("*.xml")) if _is_metashape(file)]
         if not camera_files and model is not None:
             return "colmap", model
-        if not camera_files:
-            raise refuse(path, "neither of these in the folder", EXPECTED, "Hand in the folder with the cameras")
-        path = camera_files[0]
+        foreign = [] if camera_files else foreign_files(path)[:1]
+        if not camera_files and not foreign:
+            raise refuse(path, "none of these in the folder", EXPECTED, "Hand in the folder with the cameras")
+        path = (camera_files or foreign)[0]
     elif not path.is_file():
         raise refuse(path, "nothing", EXPECTED, "Check the path")
     if path.suffix.lower() == ".xml" and _is_metashape(path):
         return "metashape", path
+    foreign = foreign_kind(path)
+    if foreign is not None:
+        raise refuse(path, foreign[0], EXPECTED, foreign[1])
     if path.suffix.lower() not in (".json", ".sfm"):
         raise refuse(path, f"a file ending in '{path.suffix}'", EXPECTED, "Hand in the folder with the cameras")
     tree = read_json(path)
+    if not {"frames", "views"} & set(tree):
+        raise refuse(path, f"an object of {', '.join(sorted(tree))[:100] or 'nothing'}", EXPECTED, "Check the file")
     return ("sfm" if is_sfm(tree) else "transforms" if "frames" in tree else "camera.json"), path
 
 
@@ -321,7 +316,7 @@ def _is_metashape(path: Path) -> bool:
     return b"<document" in head and b"<chunk" in head
 
 
-def _home(path: Path) -> Path:
+def home_of(path: Path) -> Path:
     return Path(path) if Path(path).is_dir() else Path(path).parent
 
 
@@ -344,7 +339,7 @@ def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -
 def _shot(frame: CameraFrame, picture: Path, mask: Path | None) -> CapturedPicture:
     focal, centre, size = pinhole(frame.lens)
     camera = Camera(frame.world_from_cam, focal, centre, size, frame.name)
-    return CapturedPicture(camera, frame.lens, picture, frame.pixels, mask)
+    return CapturedPicture(camera, frame.lens, picture, frame.pixels, frame.picture, mask)
 
 
 def _checked(picture: Path, shot: CapturedPicture) -> int:
@@ -434,13 +429,16 @@ def _unsaturated(encoded: np.ndarray, saturation: float) -> Bool[np.ndarray, "h 
     return np.asarray(np.logical_and.reduce(below))
 
 
+def may_have_alpha(shot: CapturedPicture) -> bool:
+    """Whether the picture, or an EXR that it replaces, may have an alpha, by its ending."""
+    return shot.picture.suffix.lower() not in OPAQUE or shot.alpha_of is not None
+
+
 def _alpha(shot: CapturedPicture) -> Float[np.ndarray, "h w"] | None:
     """The alpha of the picture, or of the EXR that it replaces."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")
-    kind = shot.picture.suffix.lower()
-    # JPEGs and RAW files have none, so they need not be decoded.
-    if kind not in (".jpg", ".jpeg", *RAW):
+    if shot.picture.suffix.lower() not in OPAQUE:
         alpha = read_stored_pixels(shot.picture, shot.pixels)[1]
         if alpha is not None:
             return alpha

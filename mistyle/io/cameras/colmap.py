@@ -41,11 +41,37 @@ class SparsePoints:
 
 
 def find_model(path: Path) -> Path | None:
-    """The folder with cameras and images (.bin or .txt): `path` itself, or its sparse/0, sparse or 0; else None."""
-    for folder in (path, path / "sparse" / "0", path / "sparse", path / "0"):
-        if all(any((folder / f"{name}{ending}").is_file() for ending in (".bin", ".txt")) for name in FILES):
+    """The folder with cameras and images (.bin or .txt): `path` itself, or the largest of the numbered models in its
+    `sparse`, its sparse, or its own largest numbered model; else None."""
+    for folder in (path, *_largest(path / "sparse"), path / "sparse", *_largest(path)):
+        if _is_model(folder):
             return folder
     return None
+
+
+def models_below(folder: Path) -> list[tuple[Path, int]]:
+    """The numbered models in a folder, as COLMAP writes one for each connected part, with their numbers of images;
+    the largest first, equal ones by number."""
+    numbered = [f for f in folder.iterdir() if f.name.isdecimal() and _is_model(f)] if folder.is_dir() else []
+    return sorted(((f, _image_count(f)) for f in numbered), key=lambda pair: (-pair[1], int(pair[0].name)))
+
+
+def _largest(folder: Path) -> list[Path]:
+    return [model for model, _ in models_below(folder)[:1]]
+
+
+def _is_model(folder: Path) -> bool:
+    return all(any((folder / f"{name}{ending}").is_file() for ending in (".bin", ".txt")) for name in FILES)
+
+
+def _image_count(folder: Path) -> int:
+    """The number of images of a model, by the head of its file; 0 where a text does not state it."""
+    path, binary = _file(folder, "images")
+    head = read_bytes(path, count=1000)
+    if binary:
+        return struct.unpack("<Q", head[:8])[0] if len(head) >= 8 else 0
+    stated = re.search(rb"# Number of images: (\d+)", head)
+    return int(stated[1]) if stated else 0
 
 
 def read_model(folder: Path) -> list[CameraFrame]:

@@ -7,7 +7,7 @@ older files of the chunk, leads on to the space of exported meshes: x = scale ·
     y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p2 (r² + 2 y²) + 2 p1 x y
     pixel = (width / 2 + cx + x' (f + b1) + y' b2, height / 2 + cy + y' f)
 
-(Metashape Professional Edition User Manual, appendix D). geometry/lens.py has p1 and p2 exchanged.
+(Metashape Professional Edition User Manual, appendix D). geometry/lens.py has p1 and p2 exchanged; b2 is its skew.
 """
 
 from pathlib import Path
@@ -24,7 +24,6 @@ from mistyle.io.sandbox.bounds import read_bytes, refuse
 
 MAX_CAMERAS = 4096
 MAX_BYTES = 256 << 20
-SKEW = 0.1  # pixels at the picture's border that b2 may move
 AGAIN = "Export the cameras again (File > Export > Export Cameras, Agisoft XML)"
 UNDISTORT = "Undistort the photographs in Metashape (Export > Undistort Photos), or export a COLMAP model"
 # The coefficients of a calibration; a missing one is 0.
@@ -36,7 +35,7 @@ def read_cameras(path: Path) -> list[CameraFrame]:
 
     They are in the space of exported meshes. `CameraFrame.picture` is the camera's label.
 
-    Refused: lenses other than `frame` (fisheye, spherical), k4, p3, p4 and b2 that matter, several chunks.
+    Refused: lenses other than `frame` (fisheye, spherical), p3 and p4, several chunks.
     """
     data = read_bytes(path, MAX_BYTES)
     try:
@@ -129,10 +128,10 @@ def _lens(sensor: Element, where: str, path: Path) -> Lens:
     value = {name: float(known.findtext(name) or 0) for name in COEFFICIENTS}
     if not (focal > 0 and np.isfinite([focal, *value.values()]).all()):
         raise refuse(path, f"a focal length of {focal:g} or coefficients of {where}", "finite numbers", AGAIN)
-    if any(value[name] for name in ("k4", "p3", "p4")) or abs(value["b2"]) * height / focal / 2 > SKEW:
-        unread = [name for name in ("k4", "p3", "p4", "b2") if value[name]]
-        raise refuse(path, f"{', '.join(unread)} in the lens of {where}", "k1, k2, k3, p1, p2 and b1", UNDISTORT)
+    unread = [name for name in ("p3", "p4") if value[name]]
+    if unread:
+        raise refuse(path, f"{', '.join(unread)} in the lens of {where}", "k1 to k4, p1, p2, b1 and b2", UNDISTORT)
     return Lens(
         (focal + value["b1"], focal), (width / 2 + value["cx"], height / 2 + value["cy"]), (height, width),
-        (value["k1"], value["k2"], value["k3"]), (value["p2"], value["p1"]),
+        (value["k1"], value["k2"], value["k3"]), (value["p2"], value["p1"]), value["k4"], value["b2"],
     )  # fmt: skip

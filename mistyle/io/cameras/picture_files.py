@@ -1,13 +1,13 @@
 """Paths of the pictures and masks that camera files name.
 
-Names are literal (a percent sign is a letter); backslashes separate folders; a picture's ending may be omitted. Only
-files in the folder of the pictures are opened: a name that leads out of it is refused, unless the user hands in the
-picture's folder.
+Names are literal (a percent sign is a letter); backslashes separate folders; a picture's ending may be omitted or be
+another. Only files in the folder of the pictures are opened: the end of a name that leads out of it is looked up there.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
+from mistyle.core.errors import InputRefused
 from mistyle.io.cameras.camera_files import ENDINGS, stem
 from mistyle.io.sandbox.bounds import inside, refuse
 
@@ -33,26 +33,57 @@ def images_folder(path: Path, model: Path) -> Path:
 
 
 def find(folder: Path, name: str, file: Path) -> Path:
-    """The picture that the camera file names, with or without its ending; in the folder or below."""
-    picture = _existing(inside(folder, name, file, HAND_IN))
+    """The picture that the camera file names, in the folder or below: by its whole name, else by the end of it. Files
+    that were made elsewhere name pictures by where they lay there."""
+    try:
+        whole = inside(folder, name, file, HAND_IN)
+    except InputRefused:
+        picture = _by_end(folder, name)
+        if picture is None:
+            raise
+        return picture
+    picture = _existing(whole) or _by_end(folder, name)
     if picture is None:
         raise refuse(folder, f"no picture {name!r}", "one for every camera", f"{ADD}. {HAND_IN}")
     return picture
 
 
 def find_elsewhere(folder: Path, name: str) -> Path:
-    """The picture of that name in the user's folder: by its full name, else without its first folders."""
+    """The picture of that name in the user's folder: by its whole name, else by the end of it."""
+    picture = _by_end(folder, name)
+    if picture is None:
+        raise refuse(folder, f"no picture {name!r}", "one for every camera", ADD)
+    return picture
+
+
+def _by_end(folder: Path, name: str) -> Path | None:
+    """The picture of that name in the folder, its first folders dropped until one exists."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..")]
     for k in range(len(parts)):
         picture = _existing(folder.joinpath(*parts[k:]))
         if picture is not None:
             return inside(folder, "/".join([*parts[k:-1], picture.name]), folder, COPY)
-    raise refuse(folder, f"no picture {name!r}", "one for every camera", ADD)
+    return None
 
 
 def _existing(exact: Path) -> Path | None:
-    """The file, or the one with a picture's ending after its name."""
-    return exact if exact.is_file() else next(iter(_with_endings(exact.parent, [exact.name])), None)
+    """The file; or the one with a picture's ending after its name; or the only one with another picture's ending, as
+    programs write that remove the background."""
+    if exact.is_file():
+        return exact
+    longer = _with_endings(exact.parent, [exact.name])
+    other = _with_endings(exact.parent, [stem(exact.name)])
+    return longer[0] if longer else other[0] if len(other) == 1 else None
+
+
+def as_named(picture: Path, name: str) -> bool:
+    """Whether a camera file names this picture so: with its folders, with or without its ending."""
+    parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part != "."]
+    return picture.parts[-len(parts) : -1] == tuple(parts[:-1]) and picture.name in (parts[-1], *_endings_of(parts[-1]))
+
+
+def _endings_of(name: str) -> list[str]:
+    return [f"{name}{e}" for ending in ENDINGS for e in (ending, ending.upper())]
 
 
 def named_mask(places: Sequence[Path], name: str, file: Path) -> Path:
@@ -75,8 +106,7 @@ def check_different(pictures: Mapping[str, Path], folder: Path) -> None:
 
 
 def _with_endings(folder: Path, names: Iterable[str]) -> list[Path]:
-    endings = [e for ending in ENDINGS for e in (ending, ending.upper())]
-    return [file for name in dict.fromkeys(names) for e in endings if (file := folder / f"{name}{e}").is_file()]
+    return [file for name in dict.fromkeys(names) for each in _endings_of(name) if (file := folder / each).is_file()]
 
 
 def mask_of_view(folder: Path, view: str, picture: Path) -> Path:

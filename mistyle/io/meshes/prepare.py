@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.asset import TURNED, Asset, Material, Source
+from mistyle.core.asset import TURNED, Asset, Material, Source, UpAxis
 from mistyle.core.image import resize
 from mistyle.core.mesh import Mesh, surface_of
 from mistyle.core.names import distinct
@@ -34,6 +34,10 @@ FACE_TEXELS = 64  # of a palette's face after resampling
 SIDEWAYS = (
     "The mesh seems to lie on its side: it is tallest along z, with its base at the lower end. --up z turns it upright."
 )
+# Rotations about X that turn a file's upward axis to Y.
+Y_FROM: dict[UpAxis, Float[np.ndarray, "3 3"]] = {
+    "y": np.eye(3), "z": Y_FROM_Z, "-y": np.diag([1.0, -1.0, -1.0]), "-z": Y_FROM_Z.T,
+}  # fmt: skip
 UnwrapMode = Literal["keep", "new", "auto"]
 
 
@@ -48,7 +52,7 @@ class _Plan:
     carried: bool = True
 
 
-def extent(raw: Raw, path: Path, uv: UnwrapMode, up: Literal["y", "z"], size: int) -> Extent:
+def extent(raw: Raw, path: Path, uv: UnwrapMode, up: UpAxis, size: int) -> Extent:
     """The size of `prepare`'s result, without unwrapping; refuses the same files."""
     check_positions(raw.positions, path)
     raw = plain_lookups(raw)
@@ -96,9 +100,7 @@ def _one_colour(colours: Float[np.ndarray, "f 3 c"]) -> bool:
     return bool(np.ptp(colours, axis=(0, 1)).max() < ONE_COLOUR)
 
 
-def prepare(
-    raw: Raw, path: Path, uv: UnwrapMode, up: Literal["y", "z"], size: int, progress: Callable[[float], None]
-) -> Asset:
+def prepare(raw: Raw, path: Path, uv: UnwrapMode, up: UpAxis, size: int, progress: Callable[[float], None]) -> Asset:
     """Choose UVs, unwrap where needed, and convert the mesh to the working space. `size` is the atlas size for the
     padding in texels."""
     check_positions(raw.positions, path)
@@ -113,7 +115,7 @@ def prepare(
             path, f"{len(area)} faces, all without area", "at least one triangle with an area", "Export the mesh again"
         )
     points = same_points(raw.positions)
-    notes = list(raw.notes) + ([f"The mesh was {TURNED}, as requested."] if up == "z" else [])
+    notes = list(raw.notes) + ([f"The mesh was turned from {up.upper()}{TURNED}, as requested."] if up != "y" else [])
     if up == "y" and lies_on_its_side(raw.positions, raw.faces):
         notes.append(SIDEWAYS)
     normals = _normals(raw, work, points, work_from_user, notes)
@@ -152,10 +154,10 @@ def prepare(
     return Asset(name=path.stem, mesh=mesh, materials=tuple(materials), source=source)
 
 
-def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
-    """Turns Z up to Y up if requested, and maps the bounding sphere to the unit sphere. The sphere is centred on the
+def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: UpAxis) -> Float[np.ndarray, "4 4"]:
+    """Turns the axis that points up to Y, and maps the bounding sphere to the unit sphere. The sphere is centred on the
     box of vertices of non-degenerate faces."""
-    turn = Y_FROM_Z if up == "z" else np.eye(3)
+    turn = Y_FROM[up]
     used = raw.positions[np.unique(raw.faces[has_area] if has_area.any() else raw.faces)] @ turn.T
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = float(np.linalg.norm(used - centre, axis=1).max())

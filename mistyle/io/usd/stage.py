@@ -63,7 +63,7 @@ def user_matrix(pxr: Any, stage: Any, notes: list[str]) -> Float[np.ndarray, "4 
     unit = unit if np.isfinite(unit) and unit > 0 else 1.0
     z_up = pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z
     if z_up or unit != 1:
-        turned = TURNED if z_up else ""
+        turned = f"turned from Z{TURNED}" if z_up else ""
         scaled = f"scaled from units of {unit:g} m to metres" if unit != 1 else ""
         notes.append(f"The stage was {' and '.join(x for x in (turned, scaled) if x)}.")
     matrix = np.eye(4)

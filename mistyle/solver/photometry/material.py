@@ -16,6 +16,7 @@ with the median residual, so that priors keep the texels plain and the gains exp
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -116,6 +117,7 @@ def material_samples(
     """The observations of a coarse atlas in small pictures."""
     mesh = traced.mesh
     small = shrunk_to(captures, SIDE)
+    small = replace(small, load=cache(small.load))  # observed twice, and photographs are slow to decode
     options = ObservationOptions(FACING, *NOISY, skies=False, move=0)
     most = max(OBSERVATIONS, LEAST_EACH * len(captures))
     texels, observed = coarse_observations(traced, small, tangents, options, ATLAS, most)

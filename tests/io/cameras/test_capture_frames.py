@@ -18,18 +18,21 @@ from scipy.spatial.transform import Rotation
 from test_colmap import Model, write_bin, write_txt
 from test_read_pictures import png16
 
-from mistyle.core.asset import Pixels
+from mistyle.core.asset import Pixels, UpAxis
 from mistyle.core.camera import Camera, orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.mesh import Mesh
-from mistyle.fitting.pipeline.outlines import camera_advice
+from mistyle.fitting.pipeline.outlines import UPWARDS, camera_advice, upright_note
 from mistyle.fitting.settings.material import ReferenceSettings
+from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.io.cameras.camera_files import camera_entry, read_cameras, read_frames, transforms
-from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots, reading_notes
+from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots
 from mistyle.io.cameras.colmap import read_model
+from mistyle.io.cameras.reading_notes import reading_notes
 from mistyle.io.cameras.views import read_views
 from mistyle.io.images.write import write_exr
+from mistyle.io.meshes.prepare import Y_FROM
 from mistyle.io.read import read_picture, read_size, read_stored_size
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.solver.cameras.outline_check import Outlines, check_outlines, overlap_line, overlap_notes
@@ -297,6 +300,29 @@ def test_pictures_above_the_folder_are_refused_with_the_true_cause(tmp_path, kin
         read_shots(home, pictures=elsewhere)
 
 
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"camera.json"}))
+@pytest.mark.parametrize("where", ["/home/someone/job/", "C:\\job\\", "../job/", "data/job/"])
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_pictures_of_files_that_were_made_elsewhere(tmp_path, kind, where, ending):
+    """Paths of another machine or folder, and pictures whose background was removed, which changed their ending."""
+    home = tmp_path / "model"
+    KINDS[kind][0](home, cameras(2), [f"{where}shots/v{k}.png" for k in range(2)])
+    folder = home / "images" if kind.startswith("colmap") else home
+    for k in range(3):
+        save(folder / "shots" / f"v{k}.{ending}", quadrants())
+    shots = read_shots(home)
+    assert [shot.picture for shot in shots] == [folder / "shots" / f"v{k}.{ending}" for k in range(2)]
+    found, rest = reading_notes(home, shots)
+    assert found.startswith(f"2 of 2 pictures were found by the end of their names (v0.{ending} for {where}")
+    assert rest.startswith("1 pictures in ") and rest.endswith(f"left out, such as v2.{ending}.")
+    save(folder / "shots" / f"v0.{'webp' if ending == 'tif' else 'tif'}", quadrants())
+    if ending == "tif":  # which of the two is unknown
+        with pytest.raises(InputRefused, match="v0"):
+            read_shots(home)
+    else:
+        assert [shot.picture for shot in read_shots(home)] == [shot.picture for shot in shots]
+
+
 def test_names_that_become_one_are_refused(tmp_path):
     nerf(tmp_path / "model", cameras(2), ["../cam0/0001.png", "../cam1/0001.png"])
     save(tmp_path / "shots" / "0001.png", quadrants())
@@ -529,6 +555,28 @@ def test_outlines_that_do_not_show_a_turn_are_said():
     (note,) = overlap_notes(["a", "b", "c"], found, 0.8, "")
     assert "do not show whether the frame is the right one" in note and note.count("degrees") == 3
     assert overlap_notes(["a", "b", "c"], found, 0.8, "", trusted=True) == ()
+
+
+@pytest.mark.parametrize("up", get_args(UpAxis))
+@pytest.mark.parametrize("tag", range(1, 9))
+def test_cameras_show_which_axis_of_a_mesh_points_up(up, tag):
+    """COLMAP's world often has Y down. People hold cameras upright, whatever their pictures' EXIF orientation is."""
+    turn = Y_FROM[up].T  # the file's axes from an upright world
+    x, y = UPWARDS[tag - 1]
+    stored = np.eye(4)
+    stored[:2, :2] = [[-y, x], [-x, -y]]  # turns upwards of the stored pixels to upwards of the camera
+
+    def seen(elevation: float) -> tuple[str, ...]:
+        ring = [orbit(40.0 * k, elevation, distance=4.0, fov=30.0, size=(8, 8)) for k in range(9)]
+        cameras = [moved_camera(camera, similarity(1.0, turn, np.zeros(3))) for camera in ring]
+        cameras = [replace(camera, world_from_cam=camera.world_from_cam @ stored) for camera in cameras]
+        return upright_note(cameras, [tag] * 9, np.eye(3) * 0.2, "y")
+
+    notes = seen(30.0)
+    assert len(notes) == (up != "y") and all(f"by the cameras {up.upper()} of its file" in note for note in notes)
+    assert seen(80.0) == ()  # from above, upwards is anywhere
+    ring = [orbit(40.0 * k, 30.0, distance=4.0, fov=30.0, size=(8, 8)) for k in range(9)]
+    assert upright_note(ring, [1] * 9, Y_FROM[up] * 3, up) == ()
 
 
 def test_pictures_without_an_outline_are_not_judged():

@@ -17,7 +17,15 @@ from mistyle.core.light import Ambient, Directional, Environment, Point
 from mistyle.core.view import View
 from mistyle.geometry.lens import Lens, distort, pinhole, px_in_photograph, resample
 from mistyle.io.cameras.camera_files import camera_entry, transforms
-from mistyle.io.cameras.captures import camera_space, check_pixels, read_captures, read_shots, silhouette, sparse_points
+from mistyle.io.cameras.captures import (
+    camera_space,
+    check_pixels,
+    read_captures,
+    read_shots,
+    silhouette,
+    sparse_points,
+)
+from mistyle.io.cameras.reading_notes import matte_note
 from mistyle.io.cameras.views import write_views
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.read import read_size
@@ -123,6 +131,22 @@ def test_alpha_is_a_mask(tmp_path):
     rgb, counts = read_captures(tmp_path, coverage=0.4).load(0)
     assert counts[4].all() and rgb[4] == pytest.approx(rgb[5])
     assert np.array_equal(silhouette(read_shots(tmp_path)[0]), picture[..., 3] >= 0.5)
+
+
+@pytest.mark.parametrize(("inside", "border", "counted"), [(254, 240, 7), (253, 250, 8), (255, 250, 7), (200, 200, 0)])
+def test_mattes_that_never_reach_one(tmp_path, inside, border, counted):
+    """Background removers write 254 of 255 inside: such pixels count; rendered alphas and translucency stay strict."""
+    picture = grey(0.5, 4)
+    picture[..., 3] = np.float32(inside) / 255
+    picture[:4, :, 3], picture[4, :, 3] = 0, np.float32(border) / 255
+    nerf(tmp_path, [picture] * 3)
+    counts = read_captures(tmp_path).load(0)[1]
+    assert counts.any(axis=1).sum() == counted and not counts[:4].any()
+    inner: list[float] = []
+    silhouette(read_shots(tmp_path)[0], inner.append)
+    assert inner == [pytest.approx(inside / 255, abs=1e-6)]
+    notes = matte_note(inner)
+    assert len(notes) == (250 < inside < 255) and all("background removers" in note for note in notes)
 
 
 def test_masks_by_view_or_by_picture(tmp_path):
@@ -334,9 +358,11 @@ def test_a_distorted_transforms_json(tmp_path):
     encoded = scene((pixel_centres(seen.size) - np.asarray(seen.centre)) / seen.focal)
     # The picture is linearised before it is resampled.
     assert counts.mean() > 0.9 and np.abs(rgb - linear_from_srgb(encoded))[counts].max() < 0.01
-    for change, reason in (({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"), ({"k4": 0.1}, "k4")):
+    (tmp_path / "transforms.json").write_text(json.dumps({**fields, "k4": 0.1, "frames": [frame]}))
+    assert read_shots(tmp_path)[0].lens.k4 == 0.1
+    for change in ({"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True, "k4": 0.1}):
         (tmp_path / "transforms.json").write_text(json.dumps({**fields, **change, "frames": [frame]}))
-        with pytest.raises(InputRefused, match=reason):
+        with pytest.raises(InputRefused, match="PINHOLE or OPENCV"):
             read_captures(tmp_path, lights="unknown")
 
 

@@ -13,8 +13,9 @@ from mistyle.core.camera import Camera, pixel_centres, px_from_world
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
 from mistyle.geometry.lens import distort
-from mistyle.io.cameras.captures import camera_space, read_captures, sparse_points
+from mistyle.io.cameras.captures import camera_space, read_captures, read_shots, sparse_points
 from mistyle.io.cameras.colmap import find_model, read_model, read_points
+from mistyle.io.cameras.reading_notes import reading_notes
 from mistyle.io.images.write import write_png
 
 # By COLMAP's documentation: number, name, parameters for a picture of 64 x 48.
@@ -228,3 +229,23 @@ def test_models_are_found_or_not(tmp_path, rng):
     assert find_model(tmp_path) == tmp_path / "sparse" / "0" == find_model(tmp_path / "sparse")
     (tmp_path / "sparse" / "0" / "images.txt").unlink()
     assert find_model(tmp_path) is None
+
+
+@pytest.mark.parametrize("write", [write_bin, write_txt])
+def test_the_largest_of_several_models_is_read(tmp_path, rng, write):
+    """COLMAP writes a model for each connected part; the first one need not be the largest."""
+    whole, sparse = model(rng), tmp_path / "sparse"
+    for number, count in (("0", 1), ("1", len(whole.images)), ("10", 2)):
+        write(sparse / number, replace(whole, images=whole.images[:count]))
+        if write is write_txt:
+            file = sparse / number / "images.txt"
+            file.write_text(f"# Number of images: {count}, mean observations per image: 1\n" + file.read_text())
+    assert find_model(tmp_path) == find_model(sparse) == sparse / "1"
+    assert find_model(sparse / "0") == sparse / "0"
+    for _, _, _, name, _ in whole.images:
+        (tmp_path / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        write_png(tmp_path / "images" / name, np.zeros((48, 64, 3), np.float32))
+    (note,) = reading_notes(tmp_path, read_shots(tmp_path))
+    assert "3 models: 1 (5 pictures), 10 (2 pictures), 0 (1 pictures). The largest, 1, was read" in note
+    notes = reading_notes(sparse / "0", read_shots(sparse / "0"))
+    assert any("4 pictures in " in note and "have no camera and were left out" in note for note in notes)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mistyle.core.errors import InputRefused
-from mistyle.geometry.lens import distort
+from mistyle.geometry.lens import distort, is_distorted, is_pinhole, pinhole, px_in_photograph, resample
 from mistyle.io.cameras.captures import camera_space, read_captures, read_shots
 from mistyle.io.images.write import write_png
 from mistyle.io.read import read_metashape
@@ -79,26 +79,41 @@ def test_without_a_reference_cameras_are_in_the_chunks_space(tmp_path):
 
 def test_distortion_is_the_manuals(tmp_path):
     """Metashape's p1 and p2 are OpenCV's p2 and p1."""
-    k1, k2, k3, p1, p2, b1 = 0.1, -0.05, 0.01, 0.002, -0.003, 4.0
-    lens = PINHOLE | {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2, "b1": b1}
+    k1, k2, k3, k4, p1, p2, b1, b2 = 0.1, -0.05, 0.01, 0.2, 0.002, -0.003, 4.0, -1.5
+    lens = PINHOLE | {"k1": k1, "k2": k2, "k3": k3, "k4": k4, "p1": p1, "p2": p2, "b1": b1, "b2": b2}
     (frame,) = read_metashape(written(tmp_path, xml(lens)))
     x, y = 0.3, -0.2
     r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
     expected = [
         x * radial + p1 * (r2 + 2 * x * x) + 2 * p2 * x * y,
         y * radial + p2 * (r2 + 2 * y * y) + 2 * p1 * x * y,
     ]
     assert np.allclose(distort(frame.lens, np.array([x, y])), expected)
     assert frame.lens.focal == (84, 80)
+    focal, centre, _ = pinhole(frame.lens)
+    found = px_in_photograph(frame.lens, focal * np.array([x, y]) + centre)
+    middle = np.array(SIZE[::-1]) / 2 + [PINHOLE["cx"], PINHOLE["cy"]]
+    assert np.allclose(found, middle + [expected[0] * (80 + b1) + expected[1] * b2, expected[1] * 80])
+
+
+def test_skewed_pixels_alone_are_resampled(tmp_path):
+    (frame,) = read_metashape(written(tmp_path, xml(PINHOLE | {"b2": 8.0})))
+    assert not is_distorted(frame.lens) and not is_pinhole(frame.lens)
+    picture = np.broadcast_to(np.arange(SIZE[1], dtype=np.float32)[:, None] + 0.5, (*SIZE, 1))
+    straight, counts = resample(frame.lens, picture, np.ones(SIZE, bool))
+    rows, columns = np.nonzero(counts)
+    expected = columns + 0.5 + 8 * (rows + 0.5 - frame.lens.centre[1]) / 80
+    inner = (expected > 0.5) & (expected < SIZE[1] - 0.5)
+    assert np.allclose(straight[rows, columns, 0][inner], expected[inner], atol=1e-4) and inner.mean() > 0.9
 
 
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         (xml(kind="fisheye"), "fisheye"),
-        (xml(PINHOLE | {"k4": 0.1}), "k4"),
-        (xml(PINHOLE | {"b2": 20}), "b2"),
+        (xml(PINHOLE | {"p3": 0.1}), "p3"),
+        (xml(PINHOLE | {"p4": 0.1}), "p4"),
         (xml({"cx": 0}), "focal length"),
         (xml(PINHOLE | {"f": "wide"}), "damaged"),
         (xml().replace('label="IMG_0"><transform>', 'label="IMG_0"><transform>1 '), "17 numbers"),

@@ -122,3 +122,27 @@ def test_arkit_apps_transforms_are_read_as_they_write_them(tmp_path):
     ahead = np.array([0.5, 0.1, 2]) - 3 * turn[:, 2]  # OpenGL looks along -z
     px, depth = px_from_world(shot.camera, ahead)
     assert np.allclose(px, (31.5, 24)) and depth == pytest.approx(3)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "named", "way"),
+    [
+        ("scene.nvm", "NVM_V3\n", "VisualSFM", "transforms.json"),
+        ("bundle.out", "# Bundle file v0.3\n", "Bundler", "transforms.json"),
+        ("scene.mvs", "MVSI", "OpenMVS", "COLMAP model"),
+        ("cameras.csv", "#name,x,y,alt,heading,pitch,roll\n", "RealityScan", "COLMAP's text format"),
+        ("sfm_data.json", '{"sfm_data_version": "0.3", "views": [], "intrinsics": []}', "OpenMVG", "openMVG2Colmap"),
+        ("reconstruction.json", '[{"cameras": {}, "shots": {}}]', "OpenSfM", "export_colmap"),
+        ("trajectory.json", '{"class_name": "PinholeCameraTrajectory"}', "Open3D", "transforms.json"),
+        ("cameras.json", '[{"id": 0, "img_name": "a", "fx": 1}]', "Gaussian splatting", "COLMAP model"),
+    ],
+)
+def test_cameras_of_other_programs_are_named(tmp_path, name, text, named, way):
+    (tmp_path / name).write_text(text)
+    (tmp_path / "other.json").write_text('{"images": []}')
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(InputRefused, match=named) as refusal:
+            read_shots(path)
+        assert way in str(refusal.value) and name in str(refusal.value)
+    with pytest.raises(InputRefused, match="an object of images"):
+        read_shots(tmp_path / "other.json")

@@ -10,7 +10,8 @@ from benchmarks.faults_corpus import dng
 from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
 from mistyle.io.cameras.camera_files import transforms
-from mistyle.io.cameras.captures import read_captures, read_shots, reading_notes
+from mistyle.io.cameras.captures import read_captures, read_shots
+from mistyle.io.cameras.reading_notes import reading_notes
 from mistyle.io.images.raw import read_raw as read_here
 from mistyle.io.read import read_exposure, read_raw, read_size, read_stored_size
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from mistyle.core.asset import Asset
+from mistyle.core.asset import Asset, UpAxis
 from mistyle.core.errors import InputRefused
 from mistyle.io.meshes.obj_read import read_obj
 from mistyle.io.meshes.ply_read import read_ply
@@ -110,15 +110,20 @@ def test_formats_agree(ending: str, tmp_path: Path) -> None:
         assert asset.source.user_positions == pytest.approx(shape.vertices, abs=1e-6)
 
 
-def test_z_up_is_turned(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("up", "tip"), [("z", (0, 0, 8)), ("-z", (0, 0, -8)), ("-y", (0, -8, 0))])
+def test_another_axis_up_is_turned(tmp_path: Path, up: UpAxis, tip: tuple) -> None:
     path = tmp_path / "tower.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 8\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
-    asset = read_mesh(path, up="z")
+    corners = np.roll(np.eye(3), np.flatnonzero(tip)[0] + 1, axis=1)[:2]
+    faces = "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n" if sum(tip) > 0 else "f 1 2 3\nf 1 4 2\nf 2 4 3\nf 3 4 1\n"
+    rows = [(0, 0, 0), *corners, tip]
+    path.write_text("".join(f"v {x:g} {y:g} {z:g}\n" for x, y, z in rows) + faces)
+    asset = read_mesh(path, up=up)
     check_asset(asset)
     assert asset.mesh.positions[3, 1] == asset.mesh.positions[:, 1].max()  # the tip is up now
     corners = asset.mesh.positions[asset.mesh.faces].astype(float)
     assert np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() > 0  # not mirrored
     assert np.linalg.det(asset.source.work_from_user[:3, :3]) > 0
+    assert f"The mesh was turned from {up.upper()} up to Y up, as requested." in asset.source.notes
 
 
 def test_obj_corners_keep_their_own_uvs_and_normals(tmp_path: Path) -> None:
