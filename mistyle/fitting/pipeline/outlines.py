@@ -53,7 +53,10 @@ def upright_note(
     best = max(along, key=lambda axis: along[axis])
     if along[best] < ALONG or best == up:
         return ()
-    return (f"The mesh is not upright: by the cameras {best.upper()} of its file points up. --up={best} turns it.",)
+    turned = " If the mesh is upright, --set references.up=z turns the cameras." if best == "z" else ""
+    return (
+        f"The mesh is not upright: by the cameras {best.upper()} of its file points up. --up={best} turns it.{turned}",
+    )
 
 
 def report_placement(placed: Any, progress: Progress) -> None:

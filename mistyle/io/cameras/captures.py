@@ -38,11 +38,12 @@ from mistyle.io.cameras.camera_files import PIXELS, SPACE, CameraFrame, ViewEntr
 from mistyle.io.cameras.colmap import SparsePoints, find_model
 from mistyle.io.cameras.foreign import foreign_files, foreign_kind
 from mistyle.io.cameras.picture_files import (
+    ADD,
     COPY,
     HAND_IN,
     check_different,
     find,
-    find_elsewhere,
+    find_by_end,
     images_folder,
     mask_of_view,
     named_mask,
@@ -124,8 +125,8 @@ def read_captures(
     saturation  encoded value 0..1 at which a channel counts as saturated (JPEGs often stay below 1)
     coverage    least alpha 0..1 of a valid pixel, less for mattes (`least_alpha`); its colour is unpremultiplied
 
-    Refused: cameras without pictures, pictures or masks of another size than their camera, views without lights,
-    masks or exposures for some views only. `check_pixels` checks the pixel values.
+    Refused: cameras without pictures (of a transforms.json, unless they are few), pictures or masks of another size
+    than their camera, views without lights, masks or exposures for some views only. `check_pixels` checks the values.
     """
     shots = read_shots(path, masks=masks, exposure=exposure, pictures=pictures)
     names = [shot.camera.name for shot in shots]
@@ -156,14 +157,23 @@ def read_shots(
     else:
         folder = _pictures_folder(kind, Path(path), file) if elsewhere is None else elsewhere
 
+        def found(name: str) -> Path | None:
+            return find(folder, name, file) if elsewhere is None else find_by_end(folder, name)
+
         def place(name: str) -> Path:
-            return find(folder, name, file) if elsewhere is None else find_elsewhere(folder, name)
+            picture = found(name)
+            if picture is None:
+                fix = f"{ADD}. {HAND_IN}" if elsewhere is None else ADD
+                raise refuse(folder, f"no picture {name!r}", "one for every camera", fix)
+            return picture
 
         def size(name: str) -> tuple[int, int]:
             return read_size(place(name), "stored")
 
         readers = {"colmap": read_colmap, "sfm": read_sfm, "metashape": read_metashape}
         frames = readers[kind](file) if kind in readers else read_frames(file, size)
+        if kind == "transforms":
+            frames = _with_pictures(frames, found)
         # The user's masks replace those that frames name.
         homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
         named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
@@ -176,6 +186,13 @@ def read_shots(
         tags = _checked(shot.picture, shot), 1 if mask is None else _checked(mask, shot)
         result.append(replace(shot, mask=mask, factor=factor, orientation=tags))
     return tuple(result)
+
+
+def _with_pictures(frames: list[CameraFrame], found: Callable[[str], Path | None]) -> list[CameraFrame]:
+    """The frames of a transforms.json whose pictures exist, as its other readers take them, if they are most;
+    else all."""
+    there = [frame for frame in frames if found(frame.picture) is not None]
+    return there if 2 * len(there) > len(frames) else frames
 
 
 def camera_space(path: Path) -> Literal["working", "own"]:

@@ -32,32 +32,21 @@ def images_folder(path: Path, model: Path) -> Path:
     return folder
 
 
-def find(folder: Path, name: str, file: Path) -> Path:
-    """The picture that the camera file names, in the folder or below: by its whole name, else by the end of it. Files
-    that were made elsewhere name pictures by where they lay there."""
+def find(folder: Path, name: str, file: Path) -> Path | None:
+    """The picture that the camera file names, in the folder or below: by its whole name, else by the end of it; None
+    where there is none. Files that were made elsewhere name pictures by where they lay there."""
     try:
         whole = inside(folder, name, file, HAND_IN)
     except InputRefused:
-        picture = _by_end(folder, name)
+        picture = find_by_end(folder, name)
         if picture is None:
             raise
         return picture
-    picture = _existing(whole) or _by_end(folder, name)
-    if picture is None:
-        raise refuse(folder, f"no picture {name!r}", "one for every camera", f"{ADD}. {HAND_IN}")
-    return picture
+    return _existing(whole) or find_by_end(folder, name)
 
 
-def find_elsewhere(folder: Path, name: str) -> Path:
-    """The picture of that name in the user's folder: by its whole name, else by the end of it."""
-    picture = _by_end(folder, name)
-    if picture is None:
-        raise refuse(folder, f"no picture {name!r}", "one for every camera", ADD)
-    return picture
-
-
-def _by_end(folder: Path, name: str) -> Path | None:
-    """The picture of that name in the folder, its first folders dropped until one exists."""
+def find_by_end(folder: Path, name: str) -> Path | None:
+    """The picture of that name in the folder, its first folders dropped until one exists; else None."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", "..")]
     for k in range(len(parts)):
         picture = _existing(folder.joinpath(*parts[k:]))

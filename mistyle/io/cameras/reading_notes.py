@@ -34,6 +34,9 @@ def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ..
     if kind != "camera.json":
         notes += [*_other_names(shots), *_left_out(shots), *_other_cameras(kind, file, Path(path))]
     if kind == "transforms":
+        frames = len(read_json(file)["frames"])
+        if frames > len(shots):
+            notes.append(f"{frames - len(shots)} of {frames} views of {file.name} have no picture and were left out.")
         applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
         if applied:
             notes.append(

@@ -574,6 +574,7 @@ def test_cameras_show_which_axis_of_a_mesh_points_up(up, tag):
 
     notes = seen(30.0)
     assert len(notes) == (up != "y") and all(f"by the cameras {up.upper()} of its file" in note for note in notes)
+    assert any("references.up=z" in note for note in notes) == (up == "z")
     assert seen(80.0) == ()  # from above, upwards is anywhere
     ring = [orbit(40.0 * k, 30.0, distance=4.0, fov=30.0, size=(8, 8)) for k in range(9)]
     assert upright_note(ring, [1] * 9, Y_FROM[up] * 3, up) == ()

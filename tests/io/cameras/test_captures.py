@@ -25,7 +25,7 @@ from mistyle.io.cameras.captures import (
     silhouette,
     sparse_points,
 )
-from mistyle.io.cameras.reading_notes import matte_note
+from mistyle.io.cameras.reading_notes import matte_note, reading_notes
 from mistyle.io.cameras.views import write_views
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.read import read_size
@@ -235,6 +235,10 @@ def test_missing_and_misfitting_pictures_are_refused(tmp_path):
     with pytest.raises(InputRefused, match="v1.png: found 32 x 24 pixels; expected 16 x 12"):
         read_captures(tmp_path)
     (tmp_path / "images" / "v1.png").unlink()
+    shots = read_shots(tmp_path)
+    assert [shot.camera.name for shot in shots] == ["v0", "v2"]
+    assert reading_notes(tmp_path, shots) == ("1 of 3 views of transforms.json have no picture and were left out.",)
+    (tmp_path / "images" / "v2.png").unlink()
     with pytest.raises(InputRefused, match="no picture './images/v1.png'"):
         read_captures(tmp_path)
     (tmp_path / "empty").mkdir()
