@@ -105,8 +105,7 @@ class RecoverSettings(BaseModel):
         default=128,
         ge=8,
         le=512,
-        description="cells of such light in a sample; pictures of few cells are noisy, and Adam fits normals to the "
-        "noise",
+        description="cells of such light in a sample; with few, pictures are noisy, and Adam fits normals to the noise",
     )
     soft_bounces: int = Field(
         default=8, ge=0, le=8, description="most estimates of indirect light under environments and ambient light"
