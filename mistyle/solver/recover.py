@@ -82,6 +82,7 @@ class Recovered:
                 where `Limits` leave them out
     notes       sentences for the report
     passes      number of passes, and how many were `planned`
+    indirect    whether estimated indirect light was subtracted from the pictures: the maps do not contain it
     """
 
     maps: tuple[Maps, ...]
@@ -94,6 +95,7 @@ class Recovered:
     notes: tuple[str, ...]
     passes: int = 0
     planned: int = 0
+    indirect: bool = False
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,8 @@ def recover(
     del work
     give_back()
     progress(1.0)
-    return replace(_recovered(context, (table, estimate, stated), residuals), passes=state.done, planned=planned)
+    done = {"passes": state.done, "planned": planned, "indirect": bool(state.direct.indirect)}
+    return replace(_recovered(context, (table, estimate, stated), residuals), **done)
 
 
 class _Work:

@@ -25,6 +25,7 @@ Kind = Literal["solve", "rounds", "pictures", "joint", "polish"]
 STARTS, RESTARTED, CONTINUED = 3, 42, 6  # starts of a solve; steps of a round with restarts, and of one without
 SOFT_COST = 16  # approximate run time of a texel under a sky, relative to one light
 SKY_CELLS = 128
+MEASURED_PATHS = 16  # samples a pixel of the indirect light in the pictures that measure a fit
 MOST = 512  # pixels along the longer side of an estimate of indirect light
 # The object's share of a picture, the covered share of the atlas, and the share of that which one picture sees.
 SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
@@ -214,6 +215,10 @@ def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool
     per = PER_COLLECTED + (settings.soft_measured * (PER_SAMPLE_CELL + PER_VISIBILITY) if soft else 0)
     traced = len(pixels) * (PER_SOFT_TRACED if soft else PER_TRACED)
     samples = sum(n * measured_subsamples(settings, soft, n) for n in pixels)
+    if settings.bounces:
+        path = shown * (PER_SOFT_PATH if soft else PER_PATH) + PER_MISS
+        estimated = sum(min(n, MOST**2) for n in pixels)
+        traced += len(pixels) * PER_LIGHT_PICTURE + estimated * (MEASURED_PATHS * path + PER_LIGHT)
     return traced + sum(pixels) * PER_LOADED + shown * samples * per
 
 

@@ -7,7 +7,7 @@ resumes from its last checkpoint.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,7 +17,7 @@ from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded, in_memory, shrunk_to, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights, has_soft
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Texels
 from mistyle.core.rows import evenly
 from mistyle.fitting.pipeline.budget import check_material, in_files
 from mistyle.fitting.pipeline.files import scene, write
@@ -39,6 +39,9 @@ from mistyle.jobs.start import read, start_engines
 from mistyle.process import memory
 from mistyle.solver.photometry.record import Photometry
 from mistyle.solver.settings import measured_subsamples
+
+if TYPE_CHECKING:
+    from mistyle.solver.recover import Recovered
 
 PICTURED = 1600  # pixels along the longer side of the pictures that the report shows, at most
 TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
@@ -130,7 +133,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         captures, placed, photometry = explained_pictures(run, asset, texels, (whole, placed), shots)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
         recovered = recovered_maps(run, asset, texels, subset(captures, fitted), after)
-        measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
+        measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered, captures, s, r))
         complete = recovered.passes == recovered.planned
         state = "" if complete else f"{recovered.passes} of {recovered.planned} passes"
         sets = list(zip(texels, recovered.maps, strict=True))
@@ -343,17 +346,21 @@ def hold_out(captures: Captures, settings: ReferenceSettings) -> tuple[list[int]
 
 
 def measure(
-    asset: Asset, maps: Sequence[Maps], captures: Captures, settings: MaterialSettings, report: Report
+    asset: Asset, recovered: "Recovered", captures: Captures, settings: MaterialSettings, report: Report
 ) -> Measured:
-    """Predict every picture from the fitted maps and compare the two."""
+    """Predict every picture from the fitted maps and compare the two. Predictions have the indirect light that was
+    subtracted from the pictures."""
     from mistyle.core.image import srgb_from_linear
     from mistyle.measure.metrics import psnr
     from mistyle.render.deferred.material_table import pack
     from mistyle.render.mitsuba.device import give_back
     from mistyle.render.mitsuba.draw import tracer
+    from mistyle.solver.indirect import Indirect, enlarged
+    from mistyle.solver.schedule import MEASURED_PATHS
 
-    chosen, sizes = settings.recover, [m.roughness.shape for m in maps]
-    traced, table = tracer(asset.mesh), pack(maps)
+    chosen, maps = settings.recover, recovered.maps
+    traced, table, sizes = tracer(asset.mesh), pack(maps), [m.roughness.shape for m in maps]
+    indirect = Indirect(asset.mesh, maps, model=chosen.model, frame=chosen.frame) if recovered.indirect else None
     second_model = "gltf" if chosen.model == "principled" else "principled"
     _, held = hold_out(captures, settings.references)
     errors: list[float] = []
@@ -367,12 +374,16 @@ def measure(
             rendered.append(first.with_model(second_model).image_and_coverage(table, 0))
         rgb, valid = captures.load(k)
         valid = valid & (rendered[0][1] > 0.999)
+        predicted = rendered[0][0]
+        if indirect is not None:
+            light = indirect.pictures(captures.cameras[k], [captures.lights[k]], MEASURED_PATHS, settings.seed + k)[0]
+            predicted = predicted + enlarged(light, captures.cameras[k].size)
         if valid.any():
-            errors.append(psnr(srgb_from_linear(rgb[valid]), srgb_from_linear(rendered[0][0][valid])))
+            errors.append(psnr(srgb_from_linear(rgb[valid]), srgb_from_linear(predicted[valid])))
         else:
             errors.append(float("nan"))
         if k in shown_pictures:
-            shown[k] = _small(captures.cameras[k], (rgb, valid), rendered[0][0])
+            shown[k] = _small(captures.cameras[k], (rgb, valid), predicted)
             scale = float(rendered[0][0][valid].mean()) if valid.any() else 0.0
             if scale > 0:
                 converted.append(float(np.abs(rendered[1][0] - rendered[0][0])[valid].mean()) / scale)

@@ -118,21 +118,6 @@ def _log_srgb(linear: Any) -> Any:
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * root - 0.055)
 
 
-def total_variation(weight: float, keys: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], Any]:
-    """A regularizer: weight · mean |difference of neighbouring texels| of every texture (or of those of `keys`)."""
-    import drjit as dr
-
-    def penalty(values: Mapping[str, Any]) -> Any:
-        total: Any = 0.0
-        for key, texture in values.items():
-            if len(texture.shape) == 3 and (keys is None or key in keys):
-                total += dr.mean(dr.abs(texture[1:] - texture[:-1]), axis=None)
-                total += dr.mean(dr.abs(texture[:, 1:] - texture[:, :-1]), axis=None)
-        return weight * total
-
-    return penalty
-
-
 def ad_integrator(scene: Any, requested: Any = None) -> tuple[Any, tuple[str, ...]]:
     """An integrator with gradients, and notes: `requested` (a plugin's name, a dictionary or an integrator), else the
     scene's own if it has gradients, else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own.
