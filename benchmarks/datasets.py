@@ -162,7 +162,7 @@ def _orb_shot(frame: CameraFrame, home: Path, ending: str) -> CapturedPicture:
     picture = _inside(home, frame.picture + ending)
     mask = _inside(home, f"{Path(frame.picture).parent.as_posix()}_mask/{Path(frame.picture).name}.png")
     camera = Camera(frame.world_from_cam, frame.lens.focal[0], frame.lens.centre, frame.lens.size, frame.name)
-    return CapturedPicture(camera, frame.lens, picture, frame.pixels, mask)
+    return CapturedPicture(camera, frame.lens, picture, frame.pixels, mask=mask)
 
 
 def _orb_light(camera: Camera, truth: Path, name: str) -> Lights:

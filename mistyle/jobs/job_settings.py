@@ -4,8 +4,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from mistyle.core.asset import UpAxis
-
 LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks, below which a camera does not fit
 
 
@@ -17,7 +15,7 @@ class ReadSettings(BaseModel):
     uv: Literal["keep", "new", "auto"] = Field(
         default="auto", description="authored UVs: keep, replace, or replace where unusable"
     )
-    up: UpAxis = Field(default="y", description="the axis of the user's file that points up")
+    up: Literal["y", "z", "-y", "-z"] = Field(default="y", description="the axis of the user's file that points up")
     max_faces: int = Field(default=5_000_000, ge=1, description="meshes with more faces are refused")
     lit: bool = Field(default=False, description="unlit glTF materials become lit ones in the asset")
 
