@@ -292,7 +292,7 @@ def _block(
     begins = np.concatenate([[True], np.diff(pixel[lit_rays]) > 0])[: len(lit_rays)]
     first, slot = np.flatnonzero(begins), np.cumsum(begins) - 1
     lit_pixels, count = pixel[lit_rays][first], np.diff(first, append=len(lit_rays))
-    variant = _variants(pixel[lit_rays], lit_rays % subsamples, subsamples, width)
+    variant = sky_parts(pixel[lit_rays], lit_rays % subsamples, subsamples, width)
     samples = _samples(surface, rays, lit_rays, (slot, texel, step, place), variant, soft, sampling.shadows)
     p = padded(len(lit_pixels))
     pixels = Pixels(*(own(mi.UInt32, _pad(a.astype(np.uint32), p)) for a in (lit_pixels, first, count)))
@@ -436,9 +436,11 @@ def _arriving(traced, point, light, camera: Camera, valid, shadows: bool) -> tup
     return direction, strength
 
 
-def _variants(pixel, subsample, subsamples: int, width: int) -> Integer[np.ndarray, " n"]:
-    """Variants that differ between the samples of a pixel and between close pixels."""
-    dither = 4 * (pixel % width % 4) + pixel // width % 4
+def sky_parts(pixel, subsample, subsamples: int, width: int) -> Integer[np.ndarray, " n"]:
+    """The parts of the sky's cells that samples see (`sky.VARIANTS`). They differ between close pixels: those of every
+    4 x 4 with one sample, of every 2 x 2 with four, see all of them."""
+    x, y = pixel % width, pixel // width
+    dither = 2 * (x % 2) + y % 2 + 4 * (2 * (x // 2 % 2) + y // 2 % 2)
     return ((subsample * max(1, VARIANTS // subsamples) + dither) % VARIANTS).astype(np.uint8)
 
 

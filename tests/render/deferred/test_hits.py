@@ -165,3 +165,14 @@ def test_a_turned_environment_turns_the_sky():
         assert made is not None
         flow = (made.direction * made.energy[..., :1]).sum(axis=(0, 1))
         np.testing.assert_allclose(flow / np.linalg.norm(flow), expected, atol=0.02)
+
+
+@pytest.mark.parametrize(("subsamples", "across"), [(1, 4), (4, 2), (16, 1)])
+def test_close_pixels_see_all_parts_of_the_sky(subsamples: int, across: int) -> None:
+    """Rows that saw the same parts would be stripes, which a fit takes for relief."""
+    width, each = 8, np.arange(subsamples)
+    pixel = np.repeat(np.arange(width * width), subsamples)
+    seen = image_samples.sky_parts(pixel, np.tile(each, width * width), subsamples, width)
+    blocks = seen.reshape(width // across, across, width // across, across, subsamples).transpose(0, 2, 1, 3, 4)
+    for block in blocks.reshape(-1, skies.VARIANTS):
+        assert sorted(block.tolist()) == list(range(skies.VARIANTS))
