@@ -15,6 +15,7 @@ class ReadSettings(BaseModel):
     uv: Literal["keep", "new", "auto"] = Field(
         default="auto", description="authored UVs: keep, replace, or replace where unusable"
     )
+    # core/asset.py's UpAxis, whose module loads numpy; settings are read without it.
     up: Literal["y", "z", "-y", "-z"] = Field(default="y", description="the axis of the user's file that points up")
     max_faces: int = Field(default=5_000_000, ge=1, description="meshes with more faces are refused")
     lit: bool = Field(default=False, description="unlit glTF materials become lit ones in the asset")

@@ -216,9 +216,9 @@ def picture_seconds(settings: RecoverSettings, pixels: Sequence[int], soft: bool
     traced = len(pixels) * (PER_SOFT_TRACED if soft else PER_TRACED)
     samples = sum(n * measured_subsamples(settings, soft, n) for n in pixels)
     if settings.bounces:
-        path = shown * (PER_SOFT_PATH if soft else PER_PATH) + PER_MISS
         estimated = sum(min(n, MOST**2) for n in pixels)
-        traced += len(pixels) * PER_LIGHT_PICTURE + estimated * (MEASURED_PATHS * path + PER_LIGHT)
+        each = MEASURED_PATHS * _path_seconds(shown, soft) + PER_LIGHT
+        traced += len(pixels) * PER_LIGHT_PICTURE + estimated * each
     return traced + sum(pixels) * PER_LOADED + shown * samples * per
 
 
@@ -272,11 +272,16 @@ def seconds(settings: RecoverSettings, one: Pass, size: Size) -> float:
     return total
 
 
+def _path_seconds(share: float, soft: bool) -> float:
+    """Seconds of a path of indirect light; the object fills a `share` of the pixels."""
+    return share * (PER_SOFT_PATH if soft else PER_PATH) + PER_MISS
+
+
 def _indirect(samples: int, size: Size, vectors: bool) -> float:
     """Seconds of an estimate of indirect light with so many samples a pixel, and of subtracting it."""
     if not samples:
         return 0.0
-    path = size.whole * (PER_SOFT_PATH if size.cells else PER_PATH) + PER_MISS
+    path = _path_seconds(size.whole, size.cells > 0)
     path *= SHARED * size.cameras + 1 - SHARED
     smoothed = PER_LIGHT + PER_VECTOR * vectors
     return size.pictures * PER_LIGHT_PICTURE + size.paths * (samples * path + smoothed) + size.pixels * PER_LOADED

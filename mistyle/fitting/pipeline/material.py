@@ -261,11 +261,8 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}
     tags = [shot.orientation[0] if shot.pixels == "stored" else 1 for shot in shots]
     sure = not ours and not any(text.startswith("Warning:") for text in warnings)
-    up = (
-        ()
-        if not sure
-        else upright_note(captures.cameras, tags, asset.source.work_from_user[:3, :3], job.settings.read.up)
-    )
+    turn = asset.source.work_from_user[:3, :3]
+    up = upright_note(captures.cameras, tags, turn, job.settings.read.up) if sure else ()
     every = (*notes, *warnings, *matte_note(inner), *up)
     return Placed(captures.cameras, captures.lights, every, figures, overlaps.overlap)
 
