@@ -2,8 +2,9 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import accumulate
 
 from mistyle.process import memory
 
@@ -67,6 +68,16 @@ def grouped(notes: Iterable[tuple[str, str]]) -> list[str]:
     return [
         f"{', '.join(who[:3])}{f' and {len(who) - 3} more' * (len(who) > 3)}: {text}" for text, who in names.items()
     ]
+
+
+def parts(report: Report, seconds: Sequence[float]) -> list[Report]:
+    """Reports of a stage's consecutive parts, which are planned to take so many seconds."""
+    ends = list(accumulate(seconds))
+
+    def part(end: float, took: float) -> Report:
+        return lambda done: report((end - (1 - done) * took) / ends[-1])
+
+    return [part(end, took) for end, took in zip(ends, seconds, strict=True)]
 
 
 class Remaining:

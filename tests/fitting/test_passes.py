@@ -4,11 +4,13 @@ import hashlib
 import json
 import signal
 
+import numpy as np
 import pytest
 from test_material import SIDE, SIZE, bowl, one_by_one, orbit
 
 import mistyle
 from mistyle.cli.main import main
+from mistyle.core.capture import in_memory, watched
 from mistyle.core.errors import Stopped
 from mistyle.fitting.pipeline import material, passes
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
@@ -123,6 +125,18 @@ def test_the_time_left_grows_by_a_quarter_at_most(monkeypatch):
     assert left[-1] < 6
     remaining.end_in(2)
     assert remaining(0.99) == pytest.approx(2)
+
+
+def test_parts_of_a_stage_and_loaded_pictures_report_their_shares():
+    told = []
+    light, reading, nothing, solving = jobs_progress.parts(told.append, (3.0, 1.0, 0.0, 4.0))
+    captures = in_memory(orbit(4, 0.55, 2), [()] * 4, [np.zeros((2, 2, 3), np.float32)] * 4)
+    seen = watched(captures, 2, reading)
+    for k in (0, 0, 3):
+        assert np.array_equal(seen.load(k)[0], captures.load(k)[0])
+    assert told == [3.5 / 8, 3.5 / 8, 4 / 8]
+    light(0.5), nothing(0.5), nothing(1.0), solving(0.25)
+    assert told[3:] == [1.5 / 8, 4 / 8, 4 / 8, 5 / 8]
 
 
 def test_a_resumed_stage_counts_from_where_it_began(monkeypatch):

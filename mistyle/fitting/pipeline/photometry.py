@@ -8,10 +8,11 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.asset import Asset
-from mistyle.core.capture import Captures
+from mistyle.core.capture import Captures, watched
 from mistyle.fitting.pipeline.job import MaterialJob
+from mistyle.fitting.pipeline.times import explaining_seconds, reading_seconds
 from mistyle.io.read import read_exposure
-from mistyle.jobs.progress import Report
+from mistyle.jobs.progress import Report, parts
 from mistyle.jobs.stages import Run
 from mistyle.solver.photometry.record import Gains, Photometry, corrected, unchanged, without_gains
 
@@ -55,7 +56,7 @@ def match_exposures(
     s = job.settings
     matched = run.record(
         "exposures", ["photometry"], [s.recover, s.light],
-        lambda report: _explained(job, asset, captures, (found, mode == "full"), report),
+        lambda report: _explained(job, asset, (captures, shots), (found, mode == "full"), report),
     )  # fmt: skip
     for text in matched.photometry.notes:
         run.progress.say(text)
@@ -63,32 +64,38 @@ def match_exposures(
 
 
 def _explained(
-    job: MaterialJob, asset: Asset, captures: Captures, points: tuple[Photometry, bool], report: Report
+    job: MaterialJob,
+    asset: Asset,
+    pictures: tuple[Captures, Sequence[Any]],
+    points: tuple[Photometry, bool],
+    report: Report,
 ) -> MatchedPictures:
-    """`points`: their photometry, and whether balances and vignetting are solved too."""
-    from mistyle.fitting.light.unknown_light import find_light
+    """`pictures` with their files; `points`: their photometry, and whether balances and vignetting are solved too."""
+    from mistyle.fitting.light.unknown_light import PICTURES, find_light
     from mistyle.render.deferred.image_samples import tangents_of
     from mistyle.render.mitsuba.draw import tracer
     from mistyle.solver.photometry.explain import explained, worth_explaining
+    from mistyle.solver.photometry.material import material_samples
     from mistyle.solver.texels.levenberg_marquardt import Options
 
-    (found, full), s, n, light, start = points, job.settings, len(captures), None, None
+    (captures, shots), (found, full), s, light, start = pictures, points, job.settings, None, None
+    n, unknown = len(captures), job.lights == "unknown"
     if n < 2 or not worth_explaining(found):
         return MatchedPictures(found, None)
     captures = corrected(captures, without_gains(found))
-    if job.lights == "unknown":
+    read = reading_seconds(shots, [math.prod(camera.size) for camera in captures.cameras])
+    lit_reading, lighting, reading, explaining = parts(report, explaining_seconds(n, read, unknown))
+    if unknown:
         begin = Gains(np.zeros((n, 3)), np.zeros(3))
         light = find_light(
-            asset.mesh, captures, s.recover, lambda done: report(0.7 * done), outside=s.light.sun, gains=begin,
-            materials=asset.materials,
+            asset.mesh, watched(captures, min(n, PICTURES), lit_reading), s.recover, lighting,
+            outside=s.light.sun, gains=begin, materials=asset.materials,
         )  # fmt: skip
         captures, start = replace(captures, lights=(light.lights,) * n), light.gains
-    options = Options(s.recover.model, floor=s.recover.roughness_floor)
     tangents = tangents_of(asset.mesh, s.recover.frame)
-    result, solved = explained(
-        tracer(asset.mesh), captures, found, tangents, options,
-        full=full, start=start,
-    )  # fmt: skip
+    samples = material_samples(tracer(asset.mesh), watched(captures, n, reading), tangents)
+    options = Options(s.recover.model, floor=s.recover.roughness_floor)
+    result, solved = explained(samples, found, options, full=full, start=start, progress=explaining)
     report(1.0)
     if result is not found:
         result = replace(result, notes=(*result.notes, *summary(result, 0)))

@@ -15,14 +15,20 @@ from mistyle.fitting.pipeline.budget import (
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.fitting.pipeline.photometry import photometry_mode
-from mistyle.fitting.pipeline.times import FIRST_PICTURES, closing_stages, recover_seconds, running
-from mistyle.geometry.lens import is_pinhole
+from mistyle.fitting.pipeline.times import (
+    FIRST_PICTURES,
+    LIGHT_SECONDS,
+    closing_stages,
+    explaining_seconds,
+    reading_seconds,
+    recover_seconds,
+    running,
+)
 from mistyle.geometry.similarity import moved, upright
 from mistyle.io.meshes.parsed_mesh import Extent
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
-    PER_BENT_PIXEL,
     PER_READ_PIXEL,
     PER_TEXEL,
     costs,
@@ -39,9 +45,9 @@ if TYPE_CHECKING:
 STARTING = 1  # of the program
 ALIGNED = 1.5  # of a mesh that is aligned
 PER_OUTLINE = 0.003  # a picture that is placed, and its outline checked
-PER_MATCHED, PER_EXPLAINED = 0.15, 0.65  # a picture whose exposure is solved by points, and with a material
-# Of an unknown light; where exposures are solved, the mean of fits that they gave the light and of others.
-LIGHT_SECONDS, LEFT_LIGHT = 15, 6
+PER_MATCHED = 0.15  # a picture whose exposure is solved by points
+# Of an unknown light where exposures are solved: the mean of fits that they gave the light and of others.
+LEFT_LIGHT = 6
 PER_FIRST_TEXEL, FIRST_TEXELS = 3e-6, 512**2  # a texel of the first asset, and most of them
 
 
@@ -73,7 +79,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": cameras_seconds(job, shots, sizes) + first_asset_seconds(len(sizes), texels, read),
         **({"photometry": 8 + PER_MATCHED * len(sizes) + read} if matched else {}),
-        **({"exposures": explaining_seconds(len(sizes), read, unknown)} if matched else {}),
+        **({"exposures": sum(explaining_seconds(len(sizes), read, unknown))} if matched else {}),
         "pictures": read,
         **({"light": LEFT_LIGHT if matched else LIGHT_SECONDS} if unknown else {}),
         "recover": recover_seconds(s, averaged, covered, soft, visible),
@@ -93,15 +99,6 @@ def plan_material(job: Any) -> dict[str, Any]:
     }
 
 
-def explaining_seconds(count: int, read: float, unknown: bool) -> float:
-    """Seconds of explaining the exposures of `count` pictures, all of which take `read` seconds to be read; for the
-    light a share of them is read too."""
-    from mistyle.fitting.light.unknown_light import PICTURES
-
-    lit = LIGHT_SECONDS + min(1, PICTURES / count) * read if unknown else 0
-    return 5 + PER_EXPLAINED * count + read + lit
-
-
 def first_asset_seconds(count: int, texels: float, read: float) -> float:
     """Seconds of projecting few of `count` pictures, all of which take `read` seconds to be read."""
     return 0.2 + min(1, FIRST_PICTURES / count) * read + min(texels, FIRST_TEXELS) * PER_FIRST_TEXEL
@@ -114,12 +111,6 @@ def cameras_seconds(job: Any, shots: Sequence["CapturedPicture"], sizes: Sequenc
     masked = sum(n for n, shot in zip(sizes, shots, strict=True) if shot.mask is not None or may_have_alpha(shot))
     aligned = ALIGNED * (job.settings.references.align + job.settings.references.refine_poses * len(sizes))
     return 0.1 + aligned + PER_OUTLINE * len(sizes) + masked * PER_READ_PIXEL
-
-
-def reading_seconds(shots: Sequence["CapturedPicture"], sizes: Sequence[int]) -> float:
-    """Seconds of reading every picture once, and of making it straight."""
-    bent = sum(n for n, shot in zip(sizes, shots, strict=True) if not is_pinhole(shot.lens))
-    return sum(sizes) * PER_READ_PIXEL + bent * PER_BENT_PIXEL
 
 
 def shares_of(job: Any, references: tuple[Captures, Sequence["CapturedPicture"]], extent: Extent) -> Visible:

@@ -4,13 +4,32 @@ from collections.abc import Sequence
 from typing import Any
 
 from mistyle.core.maps import Texels
-from mistyle.jobs.plan import PER_TEXEL
+from mistyle.geometry.lens import is_pinhole
+from mistyle.jobs.plan import PER_BENT_PIXEL, PER_READ_PIXEL, PER_TEXEL
 from mistyle.jobs.settings import thread_count
 from mistyle.solver.schedule import Visible, finishing_seconds, picture_seconds, runnable, size_from, whole_seconds
 
 FIRST_PICTURES = 8  # most pictures of the first asset: large ones are slow to read
 PER_REPORT_RAY = 7e-8  # a sample of the report's pictures
 REPORTED, PER_SHOWN_PIXEL = 8, 4e-7  # pictures that the report shows beside their prediction, and a pixel of these
+
+LIGHT_SECONDS = 15  # of an unknown light
+EXPLAINED, PER_EXPLAINED = 5, 0.65  # of exposures that are solved with a material, and of a picture of these
+
+
+def reading_seconds(shots: Sequence[Any], sizes: Sequence[int]) -> float:
+    """Seconds of reading every `CapturedPicture` once, and of making it straight."""
+    bent = sum(n for n, shot in zip(sizes, shots, strict=True) if not is_pinhole(shot.lens))
+    return sum(sizes) * PER_READ_PIXEL + bent * PER_BENT_PIXEL
+
+
+def explaining_seconds(count: int, read: float, unknown: bool) -> tuple[float, float, float, float]:
+    """Seconds of the parts of explaining the exposures of `count` pictures, all of which take `read` seconds to be
+    read: reading some of them for an unknown light, the light, reading all, and the material."""
+    from mistyle.fitting.light.unknown_light import PICTURES
+
+    light = (min(1, PICTURES / count) * read, LIGHT_SECONDS) if unknown else (0.0, 0.0)
+    return (*light, read, EXPLAINED + PER_EXPLAINED * count)
 
 
 def running(settings: Any, soft: bool, texels: float, pixels: float = 0) -> Any:

@@ -5,17 +5,15 @@ points alone gave (`solve.py`), and those solved together with the material. Poi
 where a highlight that moves looks like an exposure.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
-from mistyle.core.capture import Captures
-from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.material import (
     MatchedMaterial,
+    MaterialSamples,
     fixed_gains,
-    material_samples,
     problem_of,
     solve_with_material,
 )
@@ -23,6 +21,7 @@ from mistyle.solver.photometry.record import Gains, Photometry, gains_of, with_g
 from mistyle.solver.photometry.solve import AGREE, LOWER
 from mistyle.solver.texels.levenberg_marquardt import Options
 
+FIXED = 0.1  # of the time: the texels at given gains
 EXPLAINED = 0.05  # difference up to which a material without a veil shows that the veil was gloss
 
 
@@ -32,30 +31,32 @@ def worth_explaining(found: Photometry) -> bool:
 
 
 def explained(
-    traced: Tracer,
-    captures: Captures,
+    samples: MaterialSamples,
     found: Photometry,
-    tangents: Float[np.ndarray, "f 3 4"] | None,
     options: Options,
     *,
     full: bool = True,
     start: Gains | None = None,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[Photometry, bool]:
     """The photometry that a material explains best, and whether it was solved with the material.
 
-    `captures` are those as photographed, under known light; `start` are gains to begin at. Metallic is free whatever is
-    fitted later. Nothing is corrected where the gains make no picture's difference from the model smaller, by AGREE
-    and to LOWER of that as photographed: errors of the model (indirect light) pass for gains of some percent and lower
-    it by up to 0.008. A veil of `found` stays unless a material explains the pictures without.
+    `samples` are of the pictures as photographed, under known light; `start` are gains to begin at. Metallic is free
+    whatever is fitted later. Nothing is corrected where the gains make no picture's difference from the model smaller,
+    by AGREE and to LOWER of that as photographed: errors of the model (indirect light) pass for gains of some percent
+    and lower it by up to 0.008. A veil of `found` stays unless a material explains the pictures without.
     """
-    samples = material_samples(traced, captures, tangents)
-    problem, n = problem_of(samples, replace(options, metallic=True)), len(captures)
+    problem, n = problem_of(samples, replace(options, metallic=True)), samples.pictures
     none = Gains(np.zeros((n, 3)), np.zeros(3))
     plain = fixed_gains(samples, problem, none)
+    progress(FIXED)
     points = fixed_gains(samples, problem, gains_of(found)) if found.applied else plain
     if start is None:
         start = min((plain, points), key=lambda each: each.cost).gains
-    fit = solve_with_material(samples, problem, start, full=full)
+    progress(2 * FIXED)
+    fit = solve_with_material(
+        samples, problem, start, full=full, progress=lambda done: progress(2 * FIXED + (1 - 2 * FIXED) * done)
+    )
     veiled = _veiled(found)
     if veiled and fit.spread > EXPLAINED:
         return found, False

@@ -14,7 +14,7 @@ step the texels are solved again at the new gains. Far from the solution the obs
 with the median residual, so that priors keep the texels plain and the gains explain the difference first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -221,6 +221,7 @@ def solve_with_material(
     start: Gains,
     *,
     full: bool = True,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> MatchedMaterial:
     """Gains, vignetting and texels from a start; `full` adds balances and vignetting to the exposures. A picture with
     fewer than SHOWN observations keeps the mean exposure."""
@@ -238,6 +239,7 @@ def solve_with_material(
         gains = gains.moved(change)
         work.target(gains)
         values = work.texels(values).values
+        progress((k + 1) / STEPS)
         if np.abs(change).max() < SETTLED and k % RESTARTS == 0:
             break
     work.scale = 1.0
