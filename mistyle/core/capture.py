@@ -82,19 +82,6 @@ def shrunk_to(captures: Captures, side: int) -> Captures:
     return shrunk(captures, [-(-max(camera.size) // side) for camera in captures.cameras])
 
 
-def watched(captures: Captures, most: int, report: Callable[[float], None]) -> Captures:
-    """The captures; `report` receives the loaded share of the `most` pictures that will be loaded."""
-    loaded: set[int] = set()
-
-    def load(k: int) -> Loaded:
-        result = captures.load(k)
-        loaded.add(k)
-        report(min(1.0, len(loaded) / most))
-        return result
-
-    return replace(captures, load=load)
-
-
 def evenly_lit(captures: Captures) -> Captures:
     """The captures under white ambient light, so that no pixel counts as one at a shadow's edge."""
     return replace(captures, lights=((Ambient((1.0, 1.0, 1.0)),),) * len(captures))

@@ -10,10 +10,11 @@ from test_material import SIDE, SIZE, bowl, one_by_one, orbit
 
 import mistyle
 from mistyle.cli.main import main
-from mistyle.core.capture import in_memory, watched
+from mistyle.core.capture import in_memory
 from mistyle.core.errors import Stopped
 from mistyle.fitting.pipeline import material, passes
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
+from mistyle.fitting.pipeline.pictures import watched
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs import progress as jobs_progress
@@ -135,8 +136,10 @@ def test_parts_of_a_stage_and_loaded_pictures_report_their_shares():
     for k in (0, 0, 3):
         assert np.array_equal(seen.load(k)[0], captures.load(k)[0])
     assert told == [3.5 / 8, 3.5 / 8, 4 / 8]
-    light(0.5), nothing(0.5), nothing(1.0), solving(0.25)
-    assert told[3:] == [1.5 / 8, 4 / 8, 4 / 8, 5 / 8]
+    light(0.5)
+    nothing(0.5)
+    solving(0.25)
+    assert told[3:] == [1.5 / 8, 4 / 8, 5 / 8]
 
 
 def test_a_resumed_stage_counts_from_where_it_began(monkeypatch):

@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.asset import Asset
-from mistyle.core.capture import Captures, watched
+from mistyle.core.capture import Captures
 from mistyle.fitting.pipeline.job import MaterialJob
+from mistyle.fitting.pipeline.pictures import watched
 from mistyle.fitting.pipeline.times import explaining_seconds, reading_seconds
 from mistyle.io.read import read_exposure
 from mistyle.jobs.progress import Report, parts

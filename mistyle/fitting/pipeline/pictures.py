@@ -5,7 +5,7 @@ pixels. Blocks of pixels are averaged so that a texel stays about two blocks wid
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -47,6 +47,19 @@ def write_averaged(folder: Path, texels: Sequence[Texels], captures: Captures, a
 
     notes = check_pixels(Captures(small.cameras, small.lights, load), report)
     save_record(folder / "record", Looked(tuple(by), (*notes, *_average_notes(by))))
+
+
+def watched(captures: Captures, most: int, report: Report) -> Captures:
+    """The captures; `report` receives the loaded share of the `most` pictures that will be loaded."""
+    loaded: set[int] = set()
+
+    def load(k: int) -> Loaded:
+        result = captures.load(k)
+        loaded.add(k)
+        report(min(1.0, len(loaded) / most))
+        return result
+
+    return replace(captures, load=load)
 
 
 def read_averaged(folder: Path, captures: Captures) -> tuple[Captures, tuple[str, ...]]:

@@ -13,7 +13,7 @@ FIRST_PICTURES = 8  # most pictures of the first asset: large ones are slow to r
 PER_REPORT_RAY = 7e-8  # a sample of the report's pictures
 REPORTED, PER_SHOWN_PIXEL = 8, 4e-7  # pictures that the report shows beside their prediction, and a pixel of these
 
-LIGHT_SECONDS = 15  # of an unknown light
+LIGHT_SECONDS = 15.0  # of an unknown light
 EXPLAINED, PER_EXPLAINED = 5, 0.65  # of exposures that are solved with a material, and of a picture of these
 
 
@@ -28,8 +28,12 @@ def explaining_seconds(count: int, read: float, unknown: bool) -> tuple[float, f
     read: reading some of them for an unknown light, the light, reading all, and the material."""
     from mistyle.fitting.light.unknown_light import PICTURES
 
-    light = (min(1, PICTURES / count) * read, LIGHT_SECONDS) if unknown else (0.0, 0.0)
-    return (*light, read, EXPLAINED + PER_EXPLAINED * count)
+    return (
+        unknown * min(1, PICTURES / count) * read,
+        unknown * LIGHT_SECONDS,
+        read,
+        EXPLAINED + PER_EXPLAINED * count,
+    )
 
 
 def running(settings: Any, soft: bool, texels: float, pixels: float = 0) -> Any:

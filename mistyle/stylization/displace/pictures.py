@@ -1,7 +1,5 @@
 """Pictures of the shape before and after the displacement: matt grey under a hard key light."""
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 
@@ -35,10 +33,3 @@ def under_key(mesh: Mesh, cameras: list[Camera], seed: int) -> Float[np.ndarray,
         picture = drawn(asset_scene(shapes, camera, light, "direct"), 0, SPP, seed)
         pictures.append(picture[..., :3] + (1 - np.clip(picture[..., 3:4], 0, 1)) * GROUND)
     return srgb_from_linear(np.clip(np.concatenate(pictures, axis=1), 0, None))
-
-
-def with_positions(mesh: Mesh, positions: Float[np.ndarray, "v 3"]) -> Mesh:
-    """The mesh at other positions with the normals that belong to them."""
-    from mistyle.solver.shape.moved import turned_normals
-
-    return replace(mesh, positions=positions, corner_normals=turned_normals(mesh, positions))
