@@ -1,5 +1,6 @@
 """Photometry of pictures: what was done to them is found, from pictures of a textured shape with soft highlights."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +10,14 @@ from helpers import ROOT
 from benchmarks import recovery_pictures as drawing
 from mistyle.core.camera import pixel_centres
 from mistyle.core.capture import Captures, in_memory
+from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Environment
 from mistyle.core.maps import flat_maps
 from mistyle.fitting.pipeline.photometry import summary
 from mistyle.fitting.report.photometry import _fall
 from mistyle.io.read_mesh import read_mesh
+from mistyle.io.store.records import load_record, save_record
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
@@ -128,6 +131,18 @@ def test_pictures_that_are_covered_show_the_corners(scene):
     covered = with_gains(none, replace(none.gains, vignetting=FALL), (0.3, 0.1))
     assert (response(covered, 0, x)[0] == np.exp(fall_terms(x) @ FALL)[:, None]).all()
     assert "corners at 70 % of the centre" in summary(covered, 0)[0] and len(_fall(covered)) == 21
+
+
+def test_a_record_without_the_reach_is_not_taken_over(tmp_path):
+    """Nor does a fit look at it: the stage's key holds the program."""
+    one = unchanged(Captures((), (), lambda k: None), ())  # type: ignore[arg-type]
+    save_record(tmp_path, one)
+    assert load_record(tmp_path).reach == EVERYWHERE
+    tree = json.loads((tmp_path / "record.json").read_text())
+    del tree["fields"]["reach"]
+    (tmp_path / "record.json").write_text(json.dumps(tree))
+    with pytest.raises(InputRefused, match="reach"):
+        load_record(tmp_path)
 
 
 def test_the_gauge_is_mean_exposure_zero_and_neutral_balance(found):
