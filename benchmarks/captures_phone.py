@@ -45,7 +45,7 @@ from mistyle.core.light import Directional, Environment, to_json
 from mistyle.io.cameras.camera_files import transforms
 from mistyle.io.read import read_hdr
 from mistyle.io.store.records import load_record
-from mistyle.solver.photometry.record import Gains, coordinates, fall_terms, gains_of
+from mistyle.solver.photometry.record import Gains, coordinates, fall_terms
 
 QUICK = ["--set", "recover.solver=texels", "--set", "recover.bounces=0"]
 NAMES, SKY = ("suzanne", "avocado"), "kiara_1_dawn_1k.hdr"
@@ -192,7 +192,7 @@ def fitted(place: Path, drawn: Drawn, done: Gains, words: Sequence[Any]) -> dict
     result = {"seconds": time.perf_counter() - start}
     record = place / "out" / "work" / "exposures" / "record"
     if record.exists():
-        solved = gains_of(load_record(record).photometry).gain
+        solved = load_record(record).photometry.gains.gain
         result["exposure_error"] = float(np.abs(np.expm1(solved - done.gain)).max())
     maps = load_record(place / "out" / "work" / "recover" / "record").maps
     counts = seen(known, list({s.camera.position.tobytes(): s.camera for s in drawn.shots}.values()))

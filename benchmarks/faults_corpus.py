@@ -287,7 +287,7 @@ def _colmap() -> list[Seed]:
 
 
 def _photogrammetry() -> list[Seed]:
-    """Cameras of Meshroom and of Metashape, with their picture."""
+    """Cameras of Meshroom, Metashape and RealityScan, with their picture."""
     pose = "1 0 0 0 0 1 0 0 0 0 1 -4 0 0 0 1"
     size, lens = '<resolution width="16" height="12"/>', "<f>20</f><cx>0.5</cx><cy>0</cy><k1>0.1</k1><p1>0.01</p1>"
     agisoft = (
@@ -305,12 +305,25 @@ def _photogrammetry() -> list[Seed]:
                         "focalLength": "45", "principalPoint": ["0", "0"]}],
         "poses": [{"poseId": "1", "pose": {"transform": transform}}],
     }  # fmt: skip
+    table = (
+        "#cameras 1\n#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+        "a.png,1.5,2,-3,163.5,83.25,-20.5,45,0.02,-0.03,0.1,-0.05,0.02,0,0.004,-0.007\n"
+    )
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:DistortionModel="brown3t2" '
+        'xcr:FocalLength35mm="45" xcr:PrincipalPointU="0.02"><xcr:Rotation>1 0 0 0 0 -1 0 1 0</xcr:Rotation>'
+        "<xcr:Position>0 -4 0.5</xcr:Position><xcr:DistortionCoeficients>0.1 -0.05 0.02 0 0.004 -0.007"
+        "</xcr:DistortionCoeficients></rdf:Description></rdf:RDF></x:xmpmeta>"
+    )
     # LibRaw refuses files of a few pixels.
     larger = agisoft.replace(size, '<resolution width="32" height="24"/>')
     return [
         Seed("metashape", "captures", {"cameras.xml": agisoft.encode(), "a.png": png()}, "."),
         Seed("raw", "captures", {"cameras.xml": larger.encode(), "a.dng": dng(np.full((24, 32, 3), 30000))}, "."),
         Seed("meshroom", "captures", {"cameras.sfm": json.dumps(sfm).encode(), "a.png": png()}, "."),
+        Seed("realityscan", "captures", {"cameras.csv": table.encode(), "a.png": png()}, "."),
+        Seed("realityscan xmp", "captures", {"a.xmp": xmp.encode(), "a.png": png()}, "."),
     ]
 
 

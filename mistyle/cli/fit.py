@@ -74,8 +74,8 @@ def add_fit(verbs: Any) -> None:
         type=Path,
         nargs="?",
         metavar="REFERENCES",
-        help="a folder with pictures and camera.json, transforms.json, a COLMAP model, Meshroom's cameras.sfm or "
-        "Metashape's XML",
+        help="a folder with pictures and camera.json, transforms.json, a COLMAP model, Meshroom's cameras.sfm, "
+        "Metashape's XML, or RealityScan's CSV or XMP files",
     )
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; rerun to resume")
     verb.add_argument("--dry-run", action="store_true", help="print estimated time, memory and disk, and stop")

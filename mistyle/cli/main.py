@@ -26,6 +26,7 @@ from mistyle.cli.options import (
     PAINT_OPTIONS,
     REPORT_OPTIONS,
     SHAPE_OPTIONS,
+    VerbParser,
     add_delivery_options,
     add_job_options,
     add_memory_option,
@@ -66,7 +67,7 @@ class _TwoGroups(argparse.RawDescriptionHelpFormatter):
 
 def parser() -> argparse.ArgumentParser:
     """Every verb with its options and examples."""
-    top = argparse.ArgumentParser(
+    top = VerbParser(
         prog="mistyle",
         description="One mesh and one style picture in; the same mesh with stylized, physically based textures out.",
         epilog="examples:\n"

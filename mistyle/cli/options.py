@@ -1,8 +1,10 @@
 """Command line options that several verbs share, and their conversion to settings."""
 
 import argparse
+import re
+import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,43 @@ PRESET_HELP = (
     "draft: about a minute; standard (default); fine: 4096² and more steps; paper: the paper's method with its "
     "diffusion models (see mistyle models)"
 )
+
+
+NUMBER = re.compile(r"-\.?\d")  # begins a negative number, also one in a list or with a unit; never an option
+
+
+class VerbParser(argparse.ArgumentParser):
+    """A parser, and that of its verbs, whose options take values that begin with a dash."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        return super().parse_known_args(with_values(self, sys.argv[1:] if args is None else args), namespace)
+
+
+def with_values(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
+    """The words, with values that begin with a dash behind their options: `--up=-y`.
+
+    argparse takes each such word for an option unless it is a plain number. Here the word after an option of one value
+    is that value where it is one of its choices or begins like a number, unless it is an option too.
+    """
+    known = parser._option_string_actions
+    result: list[str] = []
+    for word in words:
+        option = _option(known, result[-1]) if result and "--" not in result else None
+        if option is not None and option.nargs is None and word not in known and _dashed(word, option.choices):
+            result[-1] += f"={word}"
+        else:
+            result.append(word)
+    return result
+
+
+def _dashed(word: str, choices: Iterable[Any] | None) -> bool:
+    return word.startswith("-") and (word in (choices or ()) or NUMBER.match(word) is not None)
+
+
+def _option(known: Mapping[str, argparse.Action], word: str) -> argparse.Action | None:
+    """The option of this name, or the only one with this beginning; None for other words."""
+    alike = {id(action): action for name, action in known.items() if word[:2] == "--" and name.startswith(word)}
+    return known.get(word, next(iter(alike.values())) if len(alike) == 1 else None)
 
 
 def examples(text: str) -> dict[str, Any]:
@@ -219,7 +258,7 @@ def add_mesh_options(verb: argparse.ArgumentParser) -> None:
         help="authored UVs: keep, replace, or (auto) replace only where unusable",
     )
     axes = ["y", "z", "-y", "-z"]
-    verb.add_argument("--up", choices=axes, help="the up axis of the mesh file (default y; --up=-y for Y down)")
+    verb.add_argument("--up", choices=axes, help="the up axis of the mesh file (default y; -y: Y down)")
     verb.add_argument("--lit", action="store_const", const=True, help="turn unlit glTF materials into lit ones")
 
 

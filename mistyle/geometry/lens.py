@@ -7,8 +7,8 @@ r² = x² + y²,
     y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p1 (r² + 2 y²) + 2 p2 x y
     pixel = (fx x' + skew y' + cx, fy y' + cy)
 
-in the pixel convention of core/camera.py. Metashape has k4 and skew, nerfstudio k4. The model holds as far as its
-radial part rises; beyond, it folds back.
+in the pixel convention of core/camera.py. Metashape has k4 and skew, nerfstudio and RealityScan k4. The
+model holds as far as its radial part rises; beyond, it folds back.
 """
 
 from dataclasses import dataclass

@@ -35,6 +35,7 @@ __all__ = [
     "read_picture",
     "read_radiance",
     "read_raw",
+    "read_realityscan",
     "read_size",
     "read_stored_pixels",
     "read_stored_size",
@@ -144,6 +145,12 @@ def read_colmap(folder: Path) -> list[Any]:
 def read_metashape(path: Path) -> list[Any]:
     """The aligned cameras of Metashape's XML as Frames; see io/cameras/metashape.py `read_cameras`."""
     return ask("metashape", Path(path))
+
+
+def read_realityscan(path: Path) -> list[Any]:
+    """The cameras of RealityScan's table or folder of XMP files as Frames, in shares of the pictures' longer side; see
+    io/cameras/realityscan.py `read_cameras`."""
+    return ask("realityscan", Path(path))
 
 
 def read_colmap_points(folder: Path) -> Any:

@@ -5,10 +5,12 @@ import json
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from mistyle.cli.main import USED, main, parser
+from mistyle.cli.options import NUMBER, with_values
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -98,6 +100,57 @@ def test_unknown_verbs_are_refused():
     with pytest.raises(SystemExit) as stopped:
         parser().parse_args(["stylise"])
     assert stopped.value.code == 2
+
+
+def verbs(top, name=""):
+    """Every verb's parser by name, those of verbs of verbs too."""
+    for action in top._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for key, each in action.choices.items():
+                yield from verbs(each, f"{name} {key}".strip())
+    if name:
+        yield name, top
+
+
+def of_one_value(verb):
+    return [(action, text) for action in verb._actions if action.nargs is None for text in action.option_strings]
+
+
+@pytest.mark.parametrize(("name", "verb"), list(verbs(parser())))
+def test_values_may_begin_with_a_dash(name, verb, monkeypatch):
+    """Numbers and choices after every option of every verb; argparse alone expects an argument."""
+    for action in verb._actions:
+        action.required = False
+        action.nargs = action.nargs if action.option_strings or action.nargs in ("?", "*") else "?"
+    monkeypatch.setattr(verb, "exit_on_error", False)
+    for action, option in of_one_value(verb):
+        numbers = ["-1", "-1e-3", "-0.5,1", "-.5", "-3cm"]
+        for value in numbers if action.choices is None else [c for c in action.choices if str(c).startswith("-")]:
+            try:
+                given = getattr(verb.parse_known_args([option, value])[0], action.dest)
+            except argparse.ArgumentError as error:
+                assert "expected one argument" not in str(error) and value in str(error)
+                continue
+            wanted = value if action.type is None else action.type(value)
+            assert given == [wanted] if isinstance(given, list) else given == wanted
+
+
+@pytest.mark.parametrize(("name", "verb"), list(verbs(parser())))
+def test_an_option_is_no_value_of_another(name, verb):
+    texts = [text for action in verb._actions for text in action.option_strings]
+    assert not [text for text in texts if NUMBER.match(text)]
+    for _, option in of_one_value(verb):
+        for other in (*texts, "-oOUT", "--", "-x", "-"):
+            assert with_values(verb, [option, other]) == [option, other]
+
+
+def test_the_up_axis_is_taken_as_it_is_named():
+    words = ["fit", "m.obj", "shots", "--up", "-y", "-o", "out", "--hold", "-1"]
+    with pytest.raises(SystemExit):  # --hold begins two options
+        parser().parse_args(words)
+    given = parser().parse_args([*words[:-2], "--iter", "-1"])
+    assert (given.up, given.out, given.iterations) == ("-y", Path("out"), -1)
+    assert with_values(parser(), ["--", "--up", "-y"]) == ["--", "--up", "-y"]
 
 
 @pytest.mark.parametrize("verb", ["stylize", "demo", "render", "bake", "fit"])

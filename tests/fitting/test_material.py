@@ -222,6 +222,36 @@ def test_a_dry_run_counts_and_makes_nothing(shots, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_realityscans_cameras_fit_the_mesh_that_they_show(shots, tmp_path, capsys):
+    """Views of RealityScan's table, in the units of the mesh's file, whose outlines are the mesh's."""
+    from scipy.spatial.transform import Rotation
+
+    from mistyle.geometry.similarity import moved_camera
+    from mistyle.io.cameras.captures import read_shots
+
+    asset = read_mesh(shots / "bowl.obj", size=SIZE)
+    enu_from_ned = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    body_from_camera = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    lines = ["#cameras 4", "#name,x,y,alt,yaw,pitch,roll,f_35mm,px_norm,py_norm,k1,k2,k3,k4,t1,t2"]
+    cameras = orbit(4, 0.55, SIDE)
+    for view in photographed(asset.mesh, cameras, [(KEYS[0],)] * 4):
+        camera = moved_camera(view.camera, np.linalg.inv(asset.source.work_from_user))
+        turned = Rotation.from_matrix(enu_from_ned.T @ camera.world_from_cam[:3, :3] @ body_from_camera.T)
+        angles, film = turned.as_euler("ZYX", degrees=True), 36 * camera.focal / SIDE
+        lines.append(
+            ",".join([f"{camera.name}.JPG", *map(repr, map(float, [*camera.position, *angles, film])), *"0" * 8])
+        )
+        pixels = np.concatenate([srgb_from_linear(np.clip(view.rgb, 0, 1)), view.coverage[..., None]], axis=-1)
+        write_png(tmp_path / f"{camera.name}.png", pixels)
+    (tmp_path / "registration.csv").write_text("\n".join(lines) + "\n")
+    job = MaterialJob(shots / "bowl.obj", tmp_path, tmp_path / "out", MaterialSettings(), "bowl", lights="unknown")
+    placed = place(job, asset, references_of(job), read_shots(tmp_path), lambda done: None)
+    assert min(placed.overlap) > 0.95
+    words = ["fit", str(shots / "bowl.obj"), str(tmp_path), "-o", str(tmp_path / "out"), "--light", "unknown", "--json"]
+    assert main([*words, "--dry-run"]) == 0
+    assert json.loads(capsys.readouterr().out)["pictures"] == 4
+
+
 def test_a_light_that_nobody_knows(shots, tmp_path, monkeypatch):
     """A sun in a dim sky, found beside the material, explains pictures that the fit has not seen."""
     asset = read_mesh(shots / "bowl.obj", size=SIZE)

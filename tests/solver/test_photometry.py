@@ -1,5 +1,8 @@
 """Photometry of pictures: what was done to them is found, from pictures of a textured shape with soft highlights."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import ROOT
@@ -7,15 +10,30 @@ from helpers import ROOT
 from benchmarks import recovery_pictures as drawing
 from mistyle.core.camera import pixel_centres
 from mistyle.core.capture import Captures, in_memory
+from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Environment
 from mistyle.core.maps import flat_maps
+from mistyle.fitting.pipeline.photometry import summary
+from mistyle.fitting.report.photometry import _fall
 from mistyle.io.read_mesh import read_mesh
+from mistyle.io.store.records import load_record, save_record
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.solver.photometry.ignored import ignored_cells
-from mistyle.solver.photometry.record import at_size, coordinates, corrected, fall_terms
+from mistyle.solver.photometry.record import (
+    EVERYWHERE,
+    as_json,
+    at_size,
+    coordinates,
+    corrected,
+    fall_terms,
+    reach_of,
+    response,
+    unchanged,
+    with_gains,
+)
 from mistyle.solver.photometry.solve import Response, _with_exif, solve_photometry
 
 SIDE, VIEWS, TEXELS = 128, 24, 128
@@ -82,6 +100,49 @@ def test_exposure_white_balance_and_vignetting_are_found_within_two_percent(foun
     assert np.abs(np.expm1(fall_terms(seen) @ (solved.vignetting - FALL))).max() < 0.02
     assert solved.applied and not np.abs(solved.veil).max()
     assert solved.spread[1] < 0.2 * solved.spread[0]
+
+
+def test_the_fall_off_is_reported_as_far_as_it_is_seen(scene):
+    """The object covers the middle third of all pictures; the polynomial beyond would make 24 % of the corners 52 %."""
+    traced, cameras, pictures = scene
+    wide = [replace(c, size=(2 * SIDE, 2 * SIDE), centre=tuple(np.array(c.centre) + SIDE / 2)) for c in cameras]
+    padded = [(np.pad(p, ((SIDE // 2,) * 2, (SIDE // 2,) * 2, (0, 0))), np.pad(m, SIDE // 2)) for p, m in pictures]
+    (exposure, balance), fall = gains(1), 4 * FALL
+    solved = solve_photometry(traced, photographed((traced, wide, padded), exposure[:, None] + balance, fall))
+    radius, log_edge = solved.gains.edge
+    at = [coordinates(c, pixel_centres(c.size))[mask] for c, (_, mask) in zip(wide, padded, strict=True)]
+    r = np.hypot(*np.concatenate(at).T)
+    assert radius == solved.reach < 0.35 and 0 < (r > radius).mean() < 0.005
+    assert np.exp(log_edge) == pytest.approx(np.exp(fall_terms(np.array([radius, 0.0])) @ fall), abs=0.04)
+    ends = np.array([[radius, 0.0], [0.0, 0.7], [0.8, 0.6], [1.0, 1.0]])
+    assert np.allclose(response(solved, 0, ends)[0], response(solved, 0, ends[0])[0])
+    (sentence,) = summary(solved, 0)
+    assert f"{100 * np.exp(log_edge):.0f} % of the centre's light at {100 * radius:.0f} % of the half" in sentence
+    assert "corners" not in sentence and len(_fall(solved)) == int(20 * radius) + 1
+    assert as_json(solved)["edge"] == {"radius": round(radius, 3), "transmission": round(float(np.exp(log_edge)), 4)}
+
+
+def test_pictures_that_are_covered_show_the_corners(scene):
+    camera = scene[1][0]
+    x = coordinates(camera, pixel_centres(camera.size)).reshape(-1, 2)
+    assert reach_of(x) == EVERYWHERE and reach_of(x[:0]) == 0
+    assert reach_of(np.concatenate([x[np.hypot(*x.T) < 0.3], x[-20:]])) < 0.3  # a few stray observations
+    none = unchanged(Captures(tuple(scene[1]), ((),) * VIEWS, lambda k: scene[2][k]), ())
+    covered = with_gains(none, replace(none.gains, vignetting=FALL), (0.3, 0.1))
+    assert (response(covered, 0, x)[0] == np.exp(fall_terms(x) @ FALL)[:, None]).all()
+    assert "corners at 70 % of the centre" in summary(covered, 0)[0] and len(_fall(covered)) == 21
+
+
+def test_a_record_without_the_reach_is_not_taken_over(tmp_path):
+    """Nor does a fit look at it: the stage's key holds the program."""
+    one = unchanged(Captures((), (), lambda k: None), ())  # type: ignore[arg-type]
+    save_record(tmp_path, one)
+    assert load_record(tmp_path).reach == EVERYWHERE
+    tree = json.loads((tmp_path / "record.json").read_text())
+    del tree["fields"]["reach"]
+    (tmp_path / "record.json").write_text(json.dumps(tree))
+    with pytest.raises(InputRefused, match="reach"):
+        load_record(tmp_path)
 
 
 def test_the_gauge_is_mean_exposure_zero_and_neutral_balance(found):

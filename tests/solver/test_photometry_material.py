@@ -112,6 +112,7 @@ def test_exposures_of_metal_and_dark_gloss_are_found(glossy):
     solved = found.exposure[:, None] + found.balance
     wrong = np.expm1(solved - done.gain)
     assert np.sqrt((wrong**2).mean()) < 0.02 and np.abs(wrong).max() < 0.04
+    assert 0.65 < found.reach < 0.66
     seen = np.linspace(0, 0.4, 5)[:, None] * np.array([[1.0, 0.0]])  # the object does not reach the corners
     assert np.abs(np.expm1(fall_terms(seen) @ (found.vignetting - FALL))).max() < 0.02
 

@@ -135,10 +135,14 @@ def summary(found: Photometry, known: int) -> tuple[str, ...]:
     stops = found.exposure / np.log(2)
     veiled = [name for name, row in zip(found.names, found.veil, strict=True) if np.abs(row).max() > 0]
     veil = " Veiling light (flare, haze) was subtracted." if veiled else ""
+    radius, fall = found.gains.edge
+    falls = f"corners at {100 * np.exp(fall):.0f} % of the centre"
+    if radius < 1:  # the mesh is not seen beyond
+        falls = f"{100 * np.exp(fall):.0f} % of the centre's light at {100 * radius:.0f} % of the half diagonal"
     prior = f" EXIF of {known} pictures was the prior." if known > 1 else ""
     return (
         f"Photometry: exposures from {stops.min():+.2f} to {stops.max():+.2f} EV, white balance within "
-        f"{100 * (np.exp(np.abs(found.balance).max()) - 1):.0f} %, corners at {100 * found.corner:.0f} % of the centre;"
+        f"{100 * (np.exp(np.abs(found.balance).max()) - 1):.0f} %, {falls};"
         f" a point differs between pictures by {100 * found.spread[1]:.0f} % instead of {100 * found.spread[0]:.0f} %."
         + veil + prior,
     )  # fmt: skip

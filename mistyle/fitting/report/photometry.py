@@ -54,7 +54,9 @@ def photometry_steps(results: Any) -> tuple[Step, ...]:
 
 
 def _fall(found: Photometry) -> list[float]:
-    radius = np.linspace(0, 1, 21)[:, None] * np.array([[1.0, 0.0]])
+    """Transmission at twentieths of the half diagonal, as far as observations reach."""
+    radius = np.linspace(0, 1, 21)
+    radius = radius[radius <= found.reach, None] * np.array([[1.0, 0.0]])
     return np.exp(fall_terms(radius) @ found.vignetting).tolist()
 
 

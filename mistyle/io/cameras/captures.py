@@ -1,11 +1,12 @@
 """Reader of a fit's references: photographs or renders with known cameras.
 
 A folder with our `camera.json` (io/cameras/camera_files.py), a NeRF/Blender `transforms.json` with its pictures, a
-COLMAP model with its `images`, Meshroom's `cameras.sfm` (io/cameras/sfm.py), or Metashape's XML of cameras
-(io/cameras/metashape.py). EXR pictures are linear and, where they have an A channel, premultiplied by it; cameras' RAW
-files are developed linearly (io/images/raw.py); all others are sRGB-encoded with straight alpha, 8 or 16 bits. Every
-picture becomes linear Rec.709 radiance seen by a pinhole camera with square pixels: encoded values go through the exact
-sRGB curve, lens distortion and unequal focal lengths are removed by resampling.
+COLMAP model with its `images`, Meshroom's `cameras.sfm` (io/cameras/sfm.py), Metashape's XML of cameras
+(io/cameras/metashape.py), or RealityScan's CSV or XMP files (io/cameras/realityscan.py). EXR pictures are linear and,
+where they have an A channel, premultiplied by it; cameras' RAW files are developed linearly (io/images/raw.py); all
+others are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture becomes linear Rec.709 radiance seen by a
+pinhole camera with square pixels: encoded values go through the exact sRGB curve, lens distortion and unequal focal
+lengths are removed by resampling.
 
 A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py):
 `CapturedPicture.pixels`, for both the picture and the mask of a view.
@@ -49,6 +50,7 @@ from mistyle.io.cameras.picture_files import (
     named_mask,
     picture_folder,
 )
+from mistyle.io.cameras.realityscan import columns_of, in_pixels, is_sidecar, sidecars
 from mistyle.io.cameras.sfm import is_sfm, read_sfm
 from mistyle.io.cameras.views import picture_of_view
 from mistyle.io.images.quantisation import fractions, linear_rows
@@ -61,6 +63,7 @@ from mistyle.io.read import (
     read_picture,
     read_radiance,
     read_raw,
+    read_realityscan,
     read_size,
     read_stored_pixels,
     read_stored_size,
@@ -68,9 +71,10 @@ from mistyle.io.read import (
 from mistyle.io.sandbox.bounds import inside, read_bytes, refuse
 
 EXPECTED = (
-    "a folder with camera.json, transforms.json, a COLMAP model (sparse/0), Meshroom's cameras.sfm or Metashape's XML, "
-    "or one of these files"
+    "a folder with camera.json, transforms.json, a COLMAP model (sparse/0), Meshroom's cameras.sfm, Metashape's XML or "
+    "RealityScan's CSV or XMP files, or one of these files"
 )
+Kind = Literal["camera.json", "transforms", "colmap", "sfm", "metashape", "realityscan"]
 KEPT = 2  # pictures held decoded
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 OPAQUE = (".jpg", ".jpeg", *RAW)  # have no alpha, so they need not be decoded for it
@@ -170,8 +174,10 @@ def read_shots(
         def size(name: str) -> tuple[int, int]:
             return read_size(place(name), "stored")
 
-        readers = {"colmap": read_colmap, "sfm": read_sfm, "metashape": read_metashape}
+        readers = {"colmap": read_colmap, "sfm": read_sfm, "metashape": read_metashape, "realityscan": read_realityscan}
         frames = readers[kind](file) if kind in readers else read_frames(file, size)
+        if kind == "realityscan":
+            frames = [in_pixels(frame, size(frame.picture)) for frame in frames]
         if kind == "transforms":
             frames = _with_pictures(frames, found)
         # The user's masks replace those that frames name.
@@ -290,24 +296,27 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
     return tuple(notes)
 
 
-def source_of(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap", "sfm", "metashape"], Path]:
-    """The kind of references at `path`, and the file (COLMAP: the model's folder) with the cameras."""
+def source_of(path: Path) -> tuple[Kind, Path]:
+    """The kind of references at `path`, and the file with the cameras; the folder of a COLMAP model or of XMP files."""
     if path.is_dir():
         camera_files = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
         camera_files += sorted(path.glob("*.sfm"))
         model = find_model(path)
         if model is None:  # it has points beside the cameras
-            camera_files += [file for file in sorted(path.glob("*.xml")) if _is_metashape(file)]
+            camera_files += tables_in(path)
         if not camera_files and model is not None:
             return "colmap", model
+        if not camera_files and sidecars(path):
+            return "realityscan", path
         foreign = [] if camera_files else foreign_files(path)[:1]
         if not camera_files and not foreign:
             raise refuse(path, "none of these in the folder", EXPECTED, "Hand in the folder with the cameras")
         path = (camera_files or foreign)[0]
     elif not path.is_file():
         raise refuse(path, "nothing", EXPECTED, "Check the path")
-    if path.suffix.lower() == ".xml" and _is_metashape(path):
-        return "metashape", path
+    kind = _kind_of(path)
+    if kind is not None:
+        return kind, path if kind != "realityscan" or path.suffix.lower() == ".csv" else path.parent
     foreign = foreign_kind(path)
     if foreign is not None:
         raise refuse(path, foreign[0], EXPECTED, foreign[1])
@@ -324,13 +333,25 @@ def _pictures_folder(kind: str, path: Path, file: Path) -> Path:
     if kind == "colmap":
         return images_folder(path, file)
     below = file.parent / "images"
-    return below if kind == "metashape" and below.is_dir() else file.parent
+    if kind == "realityscan" and file.is_dir():  # XMP files lie beside the pictures
+        return file
+    return below if kind in ("metashape", "realityscan") and below.is_dir() else file.parent
 
 
-def _is_metashape(path: Path) -> bool:
-    """Whether an XML file is one of Metashape's cameras (io/cameras/metashape.py)."""
-    head = read_bytes(path, count=4096)
-    return b"<document" in head and b"<chunk" in head
+def tables_in(folder: Path) -> list[Path]:
+    """The XML and CSV files of a folder that hold the cameras of all pictures."""
+    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in (".xml", ".csv") and file.is_file()]
+    return [file for file in files if _kind_of(file) is not None]
+
+
+def _kind_of(path: Path) -> Literal["metashape", "realityscan"] | None:
+    """The kind of cameras in a file whose ending alone does not say it."""
+    ending = path.suffix.lower()
+    if ending == ".xml":
+        head = read_bytes(path, count=4096)
+        return "metashape" if b"<document" in head and b"<chunk" in head else None
+    known = bool(columns_of(path)) if ending == ".csv" else ending == ".xmp" and is_sidecar(path)
+    return "realityscan" if known else None
 
 
 def home_of(path: Path) -> Path:

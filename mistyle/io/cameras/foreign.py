@@ -5,14 +5,11 @@ from pathlib import Path
 from mistyle.io.sandbox.bounds import read_bytes
 
 WRITE = "Reconstruct with COLMAP, or write the cameras as a transforms.json"
-COLMAP_TEXT = "Export the registration in COLMAP's text format"
 # By the file's ending: its kind, and the fix.
 ENDINGS = {
     ".nvm": ("VisualSFM's cameras", WRITE),
     ".out": ("Bundler's cameras", WRITE),
     ".mvs": ("a scene of OpenMVS", "Hand in the COLMAP model that it was made from"),
-    ".csv": ("a table, as RealityScan writes cameras", COLMAP_TEXT),
-    ".xmp": ("RealityScan's cameras, a file for each picture", COLMAP_TEXT),
 }
 # By a word near the beginning of a JSON file.
 WORDS = {

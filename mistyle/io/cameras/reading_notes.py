@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mistyle.core.asset import RAW
-from mistyle.io.cameras.captures import BELOW, WHOLE, CapturedPicture, home_of, least_alpha, source_of
+from mistyle.io.cameras.captures import BELOW, WHOLE, CapturedPicture, home_of, least_alpha, source_of, tables_in
 from mistyle.io.cameras.colmap import find_model, models_below
 from mistyle.io.cameras.picture_files import as_named
+from mistyle.io.cameras.realityscan import OPTIONAL, POSE, columns_of
 from mistyle.io.read import read_json
 
 
@@ -17,7 +18,7 @@ def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ..
     tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
     if any(tagged):
         done = (
-            "It was ignored: COLMAP models and transforms.json describe the pixels as they are stored."
+            "It was ignored: only camera.json describes upright pictures, all others the pixels as they are stored."
             if shots[0].pixels == "stored"
             else "They were turned upright: camera.json describes upright pictures."
         )
@@ -33,6 +34,8 @@ def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ..
     kind, file = source_of(Path(path))
     if kind != "camera.json":
         notes += [*_other_names(shots), *_left_out(shots), *_other_cameras(kind, file, Path(path))]
+    if kind == "realityscan" and file.is_file():
+        notes += _other_columns(file)
     if kind == "transforms":
         frames = len(read_json(file)["frames"])
         if frames > len(shots):
@@ -69,6 +72,15 @@ def _left_out(shots: Sequence[CapturedPicture]) -> list[str]:
     return result
 
 
+def _other_columns(file: Path) -> list[str]:
+    """Sentences about the columns of RealityScan's table that were not read, and those of the lens that it lacks."""
+    columns = columns_of(file)
+    other = [name for name in columns if name not in (*POSE, *OPTIONAL)]
+    lacking = [name for name in OPTIONAL if name not in columns]
+    result = [f"Columns of {file.name} that were not read: {', '.join(other)[:200]}."] if other else []
+    return result + ([f"{file.name} has no columns {', '.join(lacking)}: they count as 0."] if lacking else [])
+
+
 def _other_cameras(kind: str, file: Path, path: Path) -> list[str]:
     """Sentences about cameras beside those of `file` that were not read."""
     result = []
@@ -77,6 +89,9 @@ def _other_cameras(kind: str, file: Path, path: Path) -> list[str]:
         if len(sizes) > 1:
             listed = ", ".join(f"{folder.name} ({count} pictures)" for folder, count in sizes)
             result.append(f"{file.parent} holds {len(sizes)} models: {listed}. The largest, {file.name}, was read.")
+    if kind in ("metashape", "realityscan") and path != file and file.is_file():
+        others = [other.name for other in tables_in(file.parent) if other != file]
+        result += [f"{file.name} was read, and not {' nor '.join(others)}."] if others else []
     if kind == "transforms":
         others = [f.name for f in sorted(file.parent.glob("transforms_*.json")) if f != file]
         model = find_model(file.parent)

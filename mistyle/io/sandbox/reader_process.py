@@ -44,6 +44,7 @@ BOUNDED = (
     "gltf.check",
     "cameras.colmap",
     "cameras.metashape",
+    "cameras.realityscan",
     "cameras.camera_files",
 )
 PIPE_BYTES = 1 << 20

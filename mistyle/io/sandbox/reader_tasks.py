@@ -233,6 +233,12 @@ def metashape(path: Path) -> list[Any]:
     return read_cameras(path)
 
 
+def realityscan(path: Path) -> list[Any]:
+    from mistyle.io.cameras.realityscan import read_cameras
+
+    return read_cameras(path)
+
+
 def usd_files(path: Path) -> list[str]:
     from mistyle.io.usd.read import files_of
 
@@ -272,4 +278,5 @@ TASKS: dict[str, Callable[..., Any]] = {
     "colmap_model": colmap_model,
     "colmap_points": colmap_points,
     "metashape": metashape,
+    "realityscan": realityscan,
 }

@@ -17,7 +17,7 @@ from mistyle.solver.photometry.material import (
     problem_of,
     solve_with_material,
 )
-from mistyle.solver.photometry.record import Gains, Photometry, gains_of, with_gains, without_gains
+from mistyle.solver.photometry.record import Gains, Photometry, with_gains, without_gains
 from mistyle.solver.photometry.solve import AGREE, LOWER
 from mistyle.solver.texels.levenberg_marquardt import Options
 
@@ -50,7 +50,7 @@ def explained(
     none = Gains(np.zeros((n, 3)), np.zeros(3))
     plain = fixed_gains(samples, problem, none)
     progress(FIXED)
-    points = fixed_gains(samples, problem, gains_of(found)) if found.applied else plain
+    points = fixed_gains(samples, problem, found.gains) if found.applied else plain
     if start is None:
         start = min((plain, points), key=lambda each: each.cost).gains
     progress(2 * FIXED)
@@ -76,7 +76,7 @@ def _veiled(found: Photometry) -> bool:
 
 def _small(gains: Gains) -> bool:
     """Whether all gains are below AGREE."""
-    return max(float(np.abs(gains.gain).max()), abs(float(gains.vignetting.sum()))) < AGREE
+    return max(float(np.abs(gains.gain).max()), abs(gains.edge[1])) < AGREE
 
 
 def _note(plain: MatchedMaterial, points: MatchedMaterial, fit: MatchedMaterial, solved: bool) -> str:

@@ -30,7 +30,7 @@ from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, 
 from mistyle.render.deferred.sky import even_directions
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.least_squares import one_hot
-from mistyle.solver.photometry.record import Gains, fall_terms
+from mistyle.solver.photometry.record import Gains, fall_terms, reach_of
 from mistyle.solver.photometry.solve import positions
 from mistyle.solver.prior import log_prior_penalty, metal_f0_prior, penalty
 from mistyle.solver.table import Atlas, linked
@@ -144,7 +144,7 @@ def problem_of(samples: MaterialSamples, options: Options) -> Problem:
 
 def log_gain(samples: MaterialSamples, gains: Gains) -> Float[np.ndarray, "o 3"]:
     """Log gain of every observation."""
-    return gains.gain[samples.observations.picture] + (fall_terms(samples.x) @ gains.vignetting)[:, None]
+    return gains.gain[samples.observations.picture] + (fall_terms(samples.x, gains.reach) @ gains.vignetting)[:, None]
 
 
 def corrected_samples(
@@ -244,7 +244,7 @@ def solve_with_material(
             break
     work.scale = 1.0
     work.target(gains)
-    return _fit_of(work, gains, work.texels(work.anew(values)))
+    return _fit_of(work, replace(gains, reach=reach_of(samples.x)), work.texels(work.anew(values)))
 
 
 def fixed_gains(samples: MaterialSamples, problem: Problem, gains: Gains) -> MatchedMaterial:

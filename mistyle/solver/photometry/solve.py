@@ -29,7 +29,15 @@ from mistyle.core.light import Directional, Lights, Point
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.photometry.ignored import ignored_cells
 from mistyle.solver.photometry.least_squares import LinearFit, one_hot, solve
-from mistyle.solver.photometry.record import VEIL_TERMS, Photometry, coordinates, fall_terms, unchanged, veil_terms
+from mistyle.solver.photometry.record import (
+    VEIL_TERMS,
+    Photometry,
+    coordinates,
+    fall_terms,
+    reach_of,
+    unchanged,
+    veil_terms,
+)
 from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, collect_observations, points_of
 
 SIDE = 336  # pixels along the longer side of the small pictures
@@ -117,7 +125,7 @@ def solve_photometry(
     residual, scale = _residuals(samples, chosen, veil)
     ignored = ignored_cells(residual, scale, samples.picture, _share(samples, captures), shapes)
     return _gauged(Photometry(
-        names, chosen.gain.mean(axis=1), chosen.gain, chosen.vignetting, veil, (before, after),
+        names, chosen.gain.mean(axis=1), chosen.gain, chosen.vignetting, reach_of(samples.x), veil, (before, after),
         ignored, not agree, tuple(notes),
     ))  # fmt: skip
 
@@ -223,10 +231,8 @@ def _levels(samples: PointSamples, full: bool) -> tuple[Response, tuple[float, f
     slant = sparse.csr_array(np.tile(_sheen(few), (3, 1)))
     if full:
         gains = one_hot(np.concatenate([3 * one + c for c in range(3)]), 3 * n)
-        columns, ridge = (
-            [gains, np.tile(fall_terms(few.x), (3, 1)), slant],
-            [[1e-5] * (3 * n), FALL_RIDGE, [1e-5] * SHEEN],
-        )
+        columns = [gains, np.tile(fall_terms(few.x), (3, 1)), slant]
+        ridge = [[1e-5] * (3 * n), FALL_RIDGE, [1e-5] * SHEEN]
     else:
         columns, ridge = [one_hot(np.tile(one, 3), n)], [[1e-5] * n]
     fitted = _reflecting(few, columns, ridge)
@@ -412,8 +418,8 @@ def _gauged(found: Photometry) -> Photometry:
     # The common gain moves into the radiance, and so into the veil.
     veil = found.veil * np.exp(common + level)
     exposure, balance = exposure - level, balance - common
-    corner = abs(float(found.vignetting.sum()))
-    most = max(float(np.abs(exposure).max()), float(np.abs(balance).max()), corner, float(np.abs(veil).max()))
+    fall = abs(found.gains.edge[1])
+    most = max(float(np.abs(exposure).max()), float(np.abs(balance).max()), fall, float(np.abs(veil).max()))
     notes = found.notes
     applied = found.applied and most >= AGREE
     if not applied:

@@ -130,7 +130,6 @@ def test_arkit_apps_transforms_are_read_as_they_write_them(tmp_path):
         ("scene.nvm", "NVM_V3\n", "VisualSFM", "transforms.json"),
         ("bundle.out", "# Bundle file v0.3\n", "Bundler", "transforms.json"),
         ("scene.mvs", "MVSI", "OpenMVS", "COLMAP model"),
-        ("cameras.csv", "#name,x,y,alt,heading,pitch,roll\n", "RealityScan", "COLMAP's text format"),
         ("sfm_data.json", '{"sfm_data_version": "0.3", "views": [], "intrinsics": []}', "OpenMVG", "openMVG2Colmap"),
         ("reconstruction.json", '[{"cameras": {}, "shots": {}}]', "OpenSfM", "export_colmap"),
         ("trajectory.json", '{"class_name": "PinholeCameraTrajectory"}', "Open3D", "transforms.json"),
