@@ -18,7 +18,8 @@ trees, lens flare, and no masks. `mistyle fit --align --light unknown --hold-out
 
 `metals`: DamagedHelmet and WaterBottle with their own maps, 16 views of 256² x an environment in three positions, as
 `benchmarks.material_recovery --maps own_soft` draws and fits them; of both the worse: `metals.metallic_right` (share of
-the surface that three cameras see), `metals.albedo_psnr` and `calibration.worst` (from 0.683, over all maps).
+the surface that three cameras see), `metals.albedo_psnr` and `calibration.worst` (from 0.683, over all maps); and of
+each `metals.NAME.within_MAP`, the share of that surface within the map's stated deviation.
 
 `--only plan`: plan against time of five jobs (`captures_plan.py`). `--only cycles`: pictures that Blender drew
 (`captures_cycles.py`).
@@ -219,7 +220,8 @@ def metals(place: Path, quick: bool) -> dict[str, float]:
     for row in recovery.rows(options):
         methods, _ = recovery.measure(row, options)
         rows.append(methods["ours"])
-        for name in ("metallic_right", "albedo_psnr", "metallic_mse", "relight_psnr_l", "calibration_worst"):
+        within = [name for name in methods["ours"] if name.startswith("within_")]
+        for name in ("metallic_right", "albedo_psnr", "metallic_mse", "relight_psnr_l", *within, "calibration_worst"):
             figures[f"metals.{row.name}.{name}"] = methods["ours"][name]
             if name in methods["constant"]:
                 figures[f"metals.{row.name}.constant.{name}"] = methods["constant"][name]
