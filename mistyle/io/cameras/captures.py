@@ -50,7 +50,7 @@ from mistyle.io.cameras.picture_files import (
     named_mask,
     picture_folder,
 )
-from mistyle.io.cameras.realityscan import columns_of, in_pixels, is_sidecar, sidecars
+from mistyle.io.cameras.realityscan_files import columns_of, in_pixels, is_sidecar, sidecars
 from mistyle.io.cameras.sfm import is_sfm, read_sfm
 from mistyle.io.cameras.views import picture_of_view
 from mistyle.io.images.quantisation import fractions, linear_rows

@@ -8,7 +8,7 @@ from mistyle.core.asset import RAW
 from mistyle.io.cameras.captures import BELOW, WHOLE, CapturedPicture, home_of, least_alpha, source_of, tables_in
 from mistyle.io.cameras.colmap import find_model, models_below
 from mistyle.io.cameras.picture_files import as_named
-from mistyle.io.cameras.realityscan import OPTIONAL, POSE, columns_of
+from mistyle.io.cameras.realityscan_files import OPTIONAL, POSE, columns_of
 from mistyle.io.read import read_json
 
 

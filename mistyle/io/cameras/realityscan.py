@@ -25,7 +25,6 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -35,39 +34,16 @@ from jaxtyping import Float
 from mistyle.core.errors import InputRefused
 from mistyle.geometry.lens import Lens
 from mistyle.io.cameras.camera_files import CameraFrame, check_rotation, unique_names
+from mistyle.io.cameras.realityscan_files import LENS, MAX_BYTES, OPTIONAL, POSE, XCR, columns_in, header_of, sidecars
 from mistyle.io.sandbox.bounds import read_bytes, refuse
 
 MAX_CAMERAS = 4096
-MAX_BYTES = 16 << 20
-HEAD = 4096  # bytes in which the columns of a table are looked for
 FILM = 36.0  # millimetres along the longer side
 SHORTEST = 3.0  # millimetres of a focal length; a share of the side is less
-XCR = "http://www.capturingreality.com/ns/xcr/1.1#"
-POSE = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
-LENS = ("k1", "k2", "k3", "k4", "t1", "t2")
-OPTIONAL = ("px", "py", *LENS)  # 0 where a table has no such column
-RENAMED = {"yaw": "heading", "f_35mm": "f", "px_norm": "px", "py_norm": "py"}
 AGAIN = "Export the registration again (Internal/External camera parameters, CSV)"
 UNDISTORT = (
     "Choose Brown3 as the distortion model and align again, or export undistorted pictures with their registration"
 )
-
-
-def columns_of(path: Path) -> list[str]:
-    """The columns of a table of RealityScan's cameras, by its older names; empty for any other file."""
-    return _columns(_header(read_bytes(path, count=HEAD).decode("utf-8-sig", "replace").splitlines())[1])
-
-
-def is_sidecar(path: Path) -> bool:
-    """Whether an XMP file holds a pose by RealityScan."""
-    data = read_bytes(path, MAX_BYTES)
-    return XCR.encode() in data and b"Rotation" in data and b"Position" in data
-
-
-def sidecars(folder: Path) -> list[Path]:
-    """The XMP files of a folder with a pose by RealityScan."""
-    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() == ".xmp" and file.is_file()]
-    return [file for file in files if is_sidecar(file)]
 
 
 def read_cameras(path: Path) -> list[CameraFrame]:
@@ -84,14 +60,6 @@ def read_cameras(path: Path) -> list[CameraFrame]:
         raise refuse(path, f"a damaged file ({str(error)[:100]})", "RealityScan's cameras", AGAIN) from error
 
 
-def in_pixels(frame: CameraFrame, size: tuple[int, int]) -> CameraFrame:
-    """The frame of `read_cameras` for a picture of `size` (height, width)."""
-    lens, side = frame.lens, max(size)
-    centre = (size[1] / 2 + lens.centre[0] * side, size[0] / 2 + lens.centre[1] * side)
-    focal = (lens.focal[0] * side, lens.focal[1] * side)
-    return replace(frame, lens=replace(lens, focal=focal, centre=centre, size=size))
-
-
 def cam_from_world(heading: float, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
     """The rotation to the camera (x right, y down, z forward) of angles in degrees."""
     (cz, cy, cx), (sz, sy, sx) = (f(np.radians([heading, pitch, roll])) for f in (np.cos, np.sin))
@@ -104,22 +72,10 @@ def cam_from_world(heading: float, pitch: float, roll: float) -> Float[np.ndarra
     )
 
 
-def _header(lines: list[str]) -> tuple[int, str]:
-    """The index and text of the line with the columns: the first after a count of cameras."""
-    known = (k for k, line in enumerate(lines) if line.strip() and not line.startswith("#cameras"))
-    return (k, lines[k]) if (k := next(known, None)) is not None else (0, "")
-
-
-def _columns(header: str) -> list[str]:
-    names = [name.strip().lower() for name in re.split("[,;\t]", header.lstrip("#"))]
-    names = [RENAMED.get(name, name) for name in names]
-    return names if header.startswith("#name") or {"name", "pitch", "roll"} <= set(names) else []
-
-
 def _table_frames(path: Path) -> list[CameraFrame]:
     lines = read_bytes(path, MAX_BYTES).decode("utf-8-sig").splitlines()
-    at, header = _header(lines)
-    names = _columns(header)
+    at, header = header_of(lines)
+    names = columns_in(header)
     if "," not in header:
         raise refuse(path, f"the columns '{header[:60]}'", "columns separated by commas", AGAIN)
     missing = [name for name in POSE if name not in names]

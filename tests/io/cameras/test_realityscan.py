@@ -12,7 +12,8 @@ from mistyle.core.errors import InputRefused
 from mistyle.geometry.lens import px_in_photograph
 from mistyle.io.cameras.captures import camera_space, read_captures, read_shots
 from mistyle.io.cameras.reading_notes import reading_notes
-from mistyle.io.cameras.realityscan import cam_from_world, columns_of, in_pixels
+from mistyle.io.cameras.realityscan import cam_from_world
+from mistyle.io.cameras.realityscan_files import columns_of, in_pixels
 from mistyle.io.images.write import write_png
 from mistyle.io.read import read_realityscan
 

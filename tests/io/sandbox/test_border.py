@@ -56,8 +56,8 @@ DECODERS = {
         "io/meshes/stl_off_read",
         "io/gltf/read",
     ),
-    *("io/gltf/check", "io/gltf/materials", "io/cameras/colmap", "io/cameras/metashape", "io/sandbox/references"),
-    "io/sandbox/reader_tasks",
+    *("io/gltf/check", "io/gltf/materials", "io/cameras/colmap", "io/cameras/metashape", "io/cameras/realityscan"),
+    *("io/sandbox/references", "io/sandbox/reader_tasks"),
     *("io/usd/read", "io/usd/layers", "io/usd/materials", "io/meshes/mtl_read", "io/meshes/ply_read"),
     *("io/gltf/pose", "io/usd/stage", "io/usd/mesh"),
 }
