@@ -24,9 +24,9 @@ from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.first_look import first_asset
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.outlines import camera_advice, report_placement, upright_note
-from mistyle.fitting.pipeline.passes import pixels_of, recovered_maps
+from mistyle.fitting.pipeline.passes import recovered_maps
 from mistyle.fitting.pipeline.photometry import match_exposures
-from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
+from mistyle.fitting.pipeline.pictures import pixels_of, read_averaged, write_averaged
 from mistyle.fitting.pipeline.times import running
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems

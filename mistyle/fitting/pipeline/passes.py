@@ -19,6 +19,7 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import surface_of
 from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import write
+from mistyle.fitting.pipeline.pictures import pixels_of
 from mistyle.fitting.pipeline.times import closing_seconds
 from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.io.store.atomic import digest
@@ -121,8 +122,3 @@ def write_preliminary(
     }
     write_record(job, record, run.progress)
     run.progress.say(f"  {place}: {state}, {time.perf_counter() - run.progress.began:.0f} s after the start")
-
-
-def pixels_of(captures: Captures) -> list[int]:
-    """The number of pixels of each picture."""
-    return [camera.size[0] * camera.size[1] for camera in captures.cameras]

@@ -10,7 +10,7 @@ import numpy as np
 from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures
 from mistyle.fitting.pipeline.job import MaterialJob
-from mistyle.fitting.pipeline.pictures import watched
+from mistyle.fitting.pipeline.pictures import pixels_of, watched
 from mistyle.fitting.pipeline.times import explaining_seconds, reading_seconds
 from mistyle.io.read import read_exposure
 from mistyle.jobs.progress import Report, parts
@@ -84,7 +84,7 @@ def _explained(
     if n < 2 or not worth_explaining(found):
         return MatchedPictures(found, None)
     captures = corrected(captures, without_gains(found))
-    read = reading_seconds(shots, [math.prod(camera.size) for camera in captures.cameras])
+    read = reading_seconds(shots, pixels_of(captures))
     lit_reading, lighting, reading, explaining = parts(report, explaining_seconds(n, read, unknown))
     if unknown:
         begin = Gains(np.zeros((n, 3)), np.zeros(3))

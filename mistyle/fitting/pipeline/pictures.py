@@ -29,6 +29,11 @@ class Looked:
     notes: tuple[str, ...]
 
 
+def pixels_of(captures: Captures) -> list[int]:
+    """The number of pixels of each picture."""
+    return [camera.size[0] * camera.size[1] for camera in captures.cameras]
+
+
 def write_averaged(folder: Path, texels: Sequence[Texels], captures: Captures, average: int, report: Report) -> None:
     """Write the averaged pictures into `folder`. InputRefused where no picture has usable pixels."""
     from mistyle.io.cameras.captures import check_pixels

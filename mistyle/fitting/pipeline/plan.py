@@ -15,6 +15,7 @@ from mistyle.fitting.pipeline.budget import (
 )
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.fitting.pipeline.photometry import photometry_mode
+from mistyle.fitting.pipeline.pictures import pixels_of
 from mistyle.fitting.pipeline.times import (
     FIRST_PICTURES,
     LIGHT_SECONDS,
@@ -57,7 +58,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     How much the pictures show of the mesh is measured, unless it must be aligned first: solver/schedule.py then gives
     typical shares.
     """
-    from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
+    from mistyle.fitting.pipeline.material import inputs_of, references_of
     from mistyle.io.cameras.captures import read_shots
 
     s, extent = job.settings, extent_of(job.mesh, job.settings)
