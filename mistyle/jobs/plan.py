@@ -1,7 +1,7 @@
 """Estimates of `--dry-run`: stages, time, memory and disk of a job. Imports nothing heavy.
 
-The times are products of counts and constants, measured by `python -m benchmarks.pipeline` and
-`benchmarks.photographs` on two cores of a server. They hold within a factor of two. Memory comes from
+The times are products of counts, constants and the machine's slowness now. The constants are seconds of two cores of
+a server, measured by `python -m benchmarks.pipeline` and `benchmarks.photographs`. Memory comes from
 `jobs/memory_budget.py`. Disk is the final size of the run folder.
 """
 
@@ -16,6 +16,7 @@ from mistyle.io.meshes.parsed_mesh import Extent
 from mistyle.jobs.inputs import input_files
 from mistyle.jobs.memory_budget import Counts, Need, must_tile, peaks, within_gb
 from mistyle.jobs.settings import thread_count
+from mistyle.process.speed import slowness
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -76,7 +77,7 @@ def needed_memory(
 
 def costs(job: Any, stages: Mapping[str, str], seconds: Mapping[str, float], sets: int) -> dict[str, Any]:
     """The common part of plans: folder, name, texture sets, seconds of each stage on the job's threads, free GB."""
-    scale = 2 / thread_count(job.settings)
+    scale = machine_scale(job.settings)
     return {
         "out": str(job.out),
         "name": job.name,
@@ -85,6 +86,12 @@ def costs(job: Any, stages: Mapping[str, str], seconds: Mapping[str, float], set
         "seconds": round(sum(seconds.values()) * scale),
         "free_gb": round(shutil.disk_usage(existing(job.out)).free / 1e9, 1),
     }
+
+
+def machine_scale(settings: Any) -> float:
+    """Seconds on the job's threads of this machine as it is now, over those of the constants."""
+    threads = thread_count(settings)
+    return slowness(threads) * 2 / threads
 
 
 def existing(folder: Path) -> Path:

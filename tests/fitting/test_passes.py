@@ -15,10 +15,14 @@ from mistyle.core.errors import Stopped
 from mistyle.fitting.pipeline import material, passes
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.fitting.pipeline.pictures import watched
+from mistyle.fitting.pipeline.times import closing_seconds
+from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
+from mistyle.jobs import plan as jobs_plan
 from mistyle.jobs import progress as jobs_progress
 from mistyle.process import stopping
+from mistyle.solver.schedule import TYPICAL
 
 BRIEF = {"iterations": 24, "rounds": 1, "solver_iterations": 6, "bounces": 1, "bounce_samples": 4, "joint": 1}
 SETTINGS = {"recover": BRIEF | {"joint_subsamples": 4}, "report": {"detail": "none"}, "atlas": {"size": SIZE}}
@@ -110,6 +114,21 @@ def test_the_command_line_takes_both_limits(shots, tmp_path, capsys):
     assert plans[1]["recover"] < plans[0]["recover"] and sum(plans[2].values()) <= 61
     assert list(plans[3]) == list(MATERIAL_STAGES) and plans[3]["exposures"] > 5
     assert [stage for stage in MATERIAL_STAGES if stage not in plans[0]] == ["photometry", "exposures", "light"]
+
+
+def test_a_plan_is_that_of_the_machine_as_it_is(shots, tmp_path, capsys, monkeypatch):
+    """Half the speed takes twice as long, and `--minutes` then leaves half the work, and twice the time after it."""
+    words = ["fit", str(shots / "bowl.obj"), str(shots / "shots"), "-o", str(tmp_path / "out"), "--dry-run", "--json"]
+    plans, limited, closing = [], [], []
+    for slow in (1.0, 2.0):
+        monkeypatch.setattr(jobs_plan, "slowness", lambda threads, slow=slow: slow * threads / 2)
+        for kept, more in ((plans, []), (limited, ["--minutes", "0.5"])):
+            assert main([*words, *more]) == 0
+            kept.append(json.loads(capsys.readouterr().out))
+        closing.append(closing_seconds(MaterialSettings(), [256**2], [], False, TYPICAL))
+    assert plans[1]["seconds"] == pytest.approx(2 * plans[0]["seconds"], abs=1)
+    assert limited[1]["seconds"] <= 31 < limited[0]["seconds"] + 2
+    assert closing[1] == pytest.approx(2 * closing[0])
 
 
 def test_the_time_left_grows_by_a_quarter_at_most(monkeypatch):

@@ -34,9 +34,9 @@ from mistyle.jobs.plan import (
     PER_TEXEL,
     costs,
     extent_of,
+    machine_scale,
     reading,
 )
-from mistyle.jobs.settings import thread_count
 from mistyle.jobs.stages import claim_run
 from mistyle.solver.schedule import COVERED, FILLED, TYPICAL, Visible
 
@@ -134,6 +134,5 @@ def _limited(settings: Any, stages: dict[str, float]) -> dict[str, float]:
     """The stages with "recover" ended by `--minutes`, if it would take longer."""
     if not settings.minutes:
         return stages
-    threads = thread_count(settings) / 2
-    left = 60 * settings.minutes * threads - sum(v for k, v in stages.items() if k != "recover")
+    left = 60 * settings.minutes / machine_scale(settings) - sum(v for k, v in stages.items() if k != "recover")
     return stages | {"recover": min(stages["recover"], max(left, 0))}

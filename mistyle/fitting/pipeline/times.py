@@ -5,8 +5,7 @@ from typing import Any
 
 from mistyle.core.maps import Texels
 from mistyle.geometry.lens import is_pinhole
-from mistyle.jobs.plan import PER_BENT_PIXEL, PER_READ_PIXEL, PER_TEXEL
-from mistyle.jobs.settings import thread_count
+from mistyle.jobs.plan import PER_BENT_PIXEL, PER_READ_PIXEL, PER_TEXEL, machine_scale
 from mistyle.solver.schedule import Visible, finishing_seconds, picture_seconds, runnable, size_from, whole_seconds
 
 FIRST_PICTURES = 8  # most pictures of the first asset: large ones are slow to read
@@ -69,4 +68,4 @@ def closing_seconds(
     covered = sum(int(t.covered.sum()) for t in texels)
     finishing = finishing_seconds(settings.recover, size_from(settings.recover, pixels, covered, soft, visible))
     total = finishing + sum(closing_stages(settings, pixels, count, soft, visible).values())
-    return total * 2 / thread_count(settings)
+    return total * machine_scale(settings)
