@@ -105,7 +105,7 @@ def evaluate(where: EvaluationSet, maps: Sequence[Maps], lights: Lights, *, glos
         first, second = (_draw(where, table, surface, fixed, gloss) for surface in surfaces)
         rendered, target = srgb_from_linear(first), srgb_from_linear(second)
         contrast = float(np.abs(metrics.detail(rendered, view.mask))[view.mask].mean())
-        errors.append(metrics.shared_error(shared, rendered, target) / max(contrast, 1e-3))
+        errors.append(metrics.warp_error(shared, rendered, target) / max(contrast, 1e-3))
         encoded.append(srgb_from_linear(_exposed(first, view)) if lit else rendered)
     compared = zip(encoded, where.details, where.masks, strict=True)
     details = [
