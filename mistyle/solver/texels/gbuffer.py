@@ -131,22 +131,6 @@ def open_sky(
     return words
 
 
-def reaches(
-    traced: Tracer, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "3"]
-) -> Bool[np.ndarray, " n"]:
-    """Whether segments from points just above the surface to the world point `target` meet no face."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
-    device.use()
-    origin = mi.Point3f(*(mi.Float(aligned(c)) for c in (position + 1e-3 * normal).T))
-    away = mi.Point3f(np.asarray(target, float).tolist()) - origin
-    distance = dr.norm(away)
-    ray = mi.Ray3f(origin, away / distance, distance * (1 - 1e-4), 0.0, [])
-    return ~np.array(traced.scene.ray_test(ray))
-
-
 def _shadow(point: Any, light: Light, camera: Camera) -> Any:
     import mitsuba
 

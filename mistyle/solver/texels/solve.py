@@ -91,7 +91,7 @@ def texel_level(
         context, texels=texels, atlas=linked(mesh, texels), captures=averaged, cameras=context.captures.cameras
     )
     if start is not None:
-        start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
+        start = [shrunk_maps(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
     finer = (
         "Finer albedo comes from the pictures over the fitted shading (recover.detail)."
         if context.settings.detail
@@ -251,7 +251,8 @@ def _enlarged(values: np.ndarray, by: int) -> np.ndarray:
     return np.repeat(np.repeat(values, by, axis=0), by, axis=1)
 
 
-def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
+def shrunk_maps(maps: Maps, size: tuple[int, int]) -> Maps:
+    """The maps at another size, nothing known."""
     fields = {name: resize(getattr(maps, name), size) for name in ("albedo", "normal", "roughness", "metallic")}
     return Maps(known=np.zeros(size, bool), **fields)
 
