@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.drjit_arrays import aligned
+from mistyle.render.mitsuba import device
 
 TURNED = np.uint32(1 << 31)  # bit of a table entry whose neighbour's picture is turned by 180 degrees
 PAGES = 4  # quarter turns of the picture
@@ -94,11 +95,11 @@ class Prices:
     limit: PatchSizeLimit | None = None
 
 
-def module(name: str) -> ModuleType:
-    """Dr.Jit's array module of that name: "llvm", "cuda" or "metal"."""
+def module(name: str = "") -> ModuleType:
+    """Dr.Jit's array module "llvm", "cuda" or "metal"; by default that of the Mitsuba variant in use."""
     import importlib
 
-    return importlib.import_module(f"drjit.{name}")
+    return importlib.import_module(f"drjit.{name or device.use().split('_')[0]}")
 
 
 def floats(dj: ModuleType, values: np.ndarray) -> Any:

@@ -30,16 +30,15 @@ def stylizer(
     `mistyle.stylization.surface.view_samples.paint_view`.
     """
     from mistyle.stylization.surface import kernels
-    from mistyle.stylization.surface.surface_painter import array_module, open_sky
+    from mistyle.stylization.surface.surface_painter import open_sky
     from mistyle.stylization.surface.synthesis import SurfaceFields, mesh_guides
     from mistyle.stylization.surface.view_samples import paint_view
 
-    module = array_module()
     fields = SurfaceFields(open_sky(mesh, seed), content, direction)
-    base = mesh_guides(mesh, style, fields, settings, seed, kernels.module(module), progress)
+    base = mesh_guides(mesh, style, fields, settings, seed, kernels.module(), progress)
 
     def paint(view: View, prior: Prior | None, rng: np.random.Generator) -> np.ndarray:
-        rgb = linear_from_srgb(paint_view(view, prior, base, int(rng.integers(2**31)), module))
+        rgb = linear_from_srgb(paint_view(view, prior, base, int(rng.integers(2**31))))
         return rgb if prior is None else np.where((prior.known & view.mask)[..., None], prior.rgb, rgb)
 
     return paint

@@ -631,7 +631,7 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     import trimesh
 
     from mistyle.core.asset import Picture
-    from mistyle.stylization.surface.surface_painter import solve_surface, surface_colour
+    from mistyle.stylization.surface.surface_painter import solve_surface
 
     loaded = trimesh.load(data("meshes/plain/spot.obj"), force="mesh")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
@@ -641,7 +641,7 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     path = data("styles/starry_night.jpg")
     picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.float32) / 255
     solution = solve_surface(mesh, Picture(picture, None, path), SurfaceSettings(samples=15_000), 0)
-    colour = style.lab_from_srgb(surface_colour(solution, solution.positions, solution.normals)[None])[0]
+    colour = style.lab_from_srgb(lookup.colour(solution, solution.positions, solution.normals)[None])[0]
     reference = style.lab_from_srgb(style.resized(solution.painting, (102, 128))).reshape(-1, 3)
     # The palette: mean colour and spread within a fifth of the painting's lightness range.
     np.testing.assert_allclose(colour.mean(axis=0), reference.mean(axis=0), atol=0.1)
@@ -650,7 +650,7 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     light = style.lab_from_srgb(solution.painting)[..., 0]
     pixel = solution.spacing / max(solution.scale) * solution.tangent
     places = solution.positions + np.random.default_rng(0).random((len(colour), 1), np.float32) * pixel
-    one, other = (surface_colour(solution, p, solution.normals) for p in (places, places + pixel))
+    one, other = (lookup.colour(solution, p, solution.normals) for p in (places, places + pixel))
     one, other = (style.lab_from_srgb(c[None])[0, :, 0] for c in (one, other))
     assert 0.6 < np.abs(one - other).mean() / np.abs(np.diff(light, axis=1)).mean() < 1.1
     # And neighbouring samples as pixels that far apart.
