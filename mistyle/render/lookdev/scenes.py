@@ -27,6 +27,7 @@ from mistyle.core.maps import OwnMaps
 from mistyle.core.paths import PACKAGE, scenes
 from mistyle.process import stopping
 from mistyle.render.mitsuba import appearance, device
+from mistyle.render.mitsuba.device import mi
 from mistyle.render.mitsuba.emitters import emitters
 from mistyle.render.mitsuba.scene import passes, sensor_dict
 
@@ -88,8 +89,6 @@ def asset_shapes(asset: Asset) -> dict[str, Any]:
 
 def asset_scene(shapes: dict[str, Any], camera: Camera, lights: Sequence[Light], integrator: str) -> Any:
     """A loaded `mi.Scene` whose environment lights the asset but is invisible. `integrator` is "path" or "direct"."""
-    import mitsuba as mi
-
     device.use()
     own = integrator in OWN and appearance.needs_path(shapes)
     chosen = appearance.integrator(OWN[integrator]) if own else integrator_dict(integrator)
@@ -111,8 +110,6 @@ def integrator_dict(name: str) -> dict[str, Any]:
 
 def file_scene(path: Path) -> Any:
     """A Mitsuba scene file as `mi.load_file` loads it. The file is trusted: Mitsuba opens all files that it names."""
-    import mitsuba as mi
-
     from mistyle.core.errors import InputRefused
 
     device.use()
@@ -134,8 +131,6 @@ def drawn(
 
     `integrator` None: the scene's own.
     """
-    import mitsuba as mi
-
     device.use()
     times, each = passes(spp)
     total: Any = 0

@@ -1,13 +1,12 @@
 """Ambient occlusion and bent normals of surface points."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.mesh import Mesh
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer, tracer
 
 CHUNK = 1 << 18
@@ -43,10 +42,6 @@ def open_sky(
 ) -> Float[np.ndarray, "n 4"]:
     """The mean direction of unoccluded sky (unit; the normal without any), and `ambient_occlusion`'s share."""
     device.use()
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba  # its type stubs know one variant only
     scene = (mesh if isinstance(mesh, Tracer) else tracer(mesh)).scene
     out = np.empty((len(positions), 4), np.float32)
     golden = (5**0.5 - 1) / 2

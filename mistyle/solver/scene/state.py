@@ -11,6 +11,7 @@ from mistyle.core.errors import UsageError
 from mistyle.render.deferred import pyramid as laplacian
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live.parameters import Parameter
+from mistyle.render.mitsuba.device import mi
 from mistyle.solver.scene import gauss_newton as scene_newton
 from mistyle.solver.scene import gradients as scene_grad
 
@@ -125,8 +126,6 @@ def prepare(
     fast: bool = True,
 ) -> tuple[SceneProblem, list[str]]:
     """Validate the inputs and assemble the problem; returns it with notes."""
-    import mitsuba as mi
-
     keys, loss, regularizers = unknowns.keys, objective.loss, objective.regularizers
     counts = [plan.iterations, plan.spp, plan.sensors_per_step, 1 if plan.spp_grad is None else plan.spp_grad]
     if min(counts) < 1 or not plan.rate > 0:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.render.mitsuba.device import dr
 from mistyle.stylization.surface import kernels
 from mistyle.stylization.surface.exemplar import exemplar as style
 from mistyle.stylization.surface.exemplar import relief as reliefs
@@ -239,8 +240,6 @@ def blended(
 
 def on_canvas(dj: ModuleType, surface: PaintedSurface, picture: Float[np.ndarray, "h w 3"]) -> Canvas:
     """A painted surface on the device; `picture` has its painting's size. Scales are pixels per working unit."""
-    import drjit as dr
-
     scale = np.array(surface.scale) / surface.spacing
     return Canvas(
         position=kernels.floats(dj, surface.positions),
@@ -269,8 +268,6 @@ def paint(
     Coordinates are clamped to it. Returns three channels and 0; with `slopes` the first two as a world vector, and the
     third.
     """
-    import drjit as dr
-
     count, reach = index.shape
     samples, weights = kernels.whole(dj, index), kernels.floats(dj, weight)
     i = dr.arange(dj.UInt, count)
