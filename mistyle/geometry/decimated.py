@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.rows import unit
 from mistyle.geometry.normals import area_vectors
+from mistyle.geometry.uvs import corner_nodes, group_rows
 
 NEIGHBOURS = 12
 CHUNK = 200_000
@@ -114,8 +115,6 @@ def _nearest_faces(positions, faces, tree, sample_face, corners, normals, tick) 
 def _smooth(home: Int[np.ndarray, " f"], chart: Int[np.ndarray, " g"], faces: Int[np.ndarray, "f 3"]) -> np.ndarray:
     """Majority vote over the three neighbours' charts, SMOOTHING times: borders become straighter, and single faces
     do not become charts."""
-    from mistyle.geometry.uvs import group_rows
-
     a, b = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)
     edge = group_rows(np.maximum(a, b), np.minimum(a, b))
     order = np.argsort(edge, kind="stable")
@@ -174,8 +173,6 @@ def _barycentric(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def _border(faces: np.ndarray, uvs: np.ndarray, chart: np.ndarray) -> Bool[np.ndarray, "g 3"]:
     """Whether the edge opposite to each corner is a border of its chart: no other face of the chart continues there
     with the same UVs."""
-    from mistyle.geometry.uvs import corner_nodes, group_rows
-
     nodes = corner_nodes(faces, uvs)
     a, b = nodes[:, [1, 2, 0]].reshape(-1), nodes[:, [2, 0, 1]].reshape(-1)
     edge = group_rows(np.maximum(a, b), np.minimum(a, b), np.repeat(chart, 3))

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset, Material
 from mistyle.core.camera import Camera
+from mistyle.core.errors import InputRefused
 from mistyle.core.light import (
     SOFT,
     Ambient,
@@ -110,8 +111,6 @@ def integrator_dict(name: str) -> dict[str, Any]:
 
 def file_scene(path: Path) -> Any:
     """A Mitsuba scene file as `mi.load_file` loads it. The file is trusted: Mitsuba opens all files that it names."""
-    from mistyle.core.errors import InputRefused
-
     device.use()
     try:
         with device.file_threads():

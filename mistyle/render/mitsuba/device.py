@@ -52,7 +52,7 @@ def use(variant: str | None = None, threads: int | None = None) -> str:
     thread count (CPU only; None keeps it): results are bit-identical only at the same count. Repeated calls are cheap;
     every function of `render/` calls it. Raises EnvironmentMissing if no variant works.
     """
-    current = mi.variant()
+    current: str = mi.variant() or ""
     if variant is None:
         variant = current if current in VARIANTS else _first_working(mi.variants())
     elif variant not in VARIANTS:

@@ -15,10 +15,12 @@ from jaxtyping import Float
 
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.capture import in_memory
+from mistyle.core.image import dilate
 from mistyle.core.light import Directional, Point
 from mistyle.core.mesh import Mesh
 from mistyle.core.rows import evenly
 from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live import walk as scene_walk
 from mistyle.render.live.parameters import Parameter
@@ -129,15 +131,11 @@ class DeferredRenderer:
         counts = np.array(view.counts)[..., 0].astype(bool)
         foreign = [k for k, material in enumerate(self.materials) if material is None]
         if foreign:
-            from mistyle.core.image import dilate
-
             counts &= ~dilate(np.isin(gbuffer(traced, camera).part, foreign), 1)
         return counts
 
     def _best_variant(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
         """The renderer that matches the scene best, over Mitsuba's variants of a normal map."""
-        from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
-
         sizes = [(2, 2) if m is None else m.size for m in self.materials]
         bumped = any("normalmap" in m.roles for m in self.materials if m is not None)
         looked = evenly(len(views), CHECKS)

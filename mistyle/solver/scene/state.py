@@ -14,6 +14,7 @@ from mistyle.render.live.parameters import Parameter
 from mistyle.render.mitsuba.device import mi
 from mistyle.solver.scene import gauss_newton as scene_newton
 from mistyle.solver.scene import gradients as scene_grad
+from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
 
 FEWEST_VIEWS = 3
 SOLVERS = ("auto", "adam", "gauss-newton")
@@ -190,8 +191,6 @@ def _free_masks(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> 
 
 def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
     """The fast path, or the reason why it does not apply."""
-    from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
-
     try:
         return DeferredRenderer(scene, chosen, views, loss if isinstance(loss, str) else "", engine), ""
     except Unsupported as reason:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.texels import pad_in_place
 from mistyle.core.asset import Asset
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import Heights
@@ -36,7 +37,6 @@ def height_maps(
 
     They belong to the normal maps: a renderer that displaces the mesh by them should leave the normal map out.
     """
-    from mistyle.atlas.texels import pad_in_place
     from mistyle.stylization.pipeline.painting import pieces, texel_side, whose
 
     factor, maps = slope / scale_of(asset.source.work_from_user), []

@@ -7,6 +7,7 @@ import numpy as np
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
+from mistyle.render.mitsuba.occlusion import ambient_occlusion
 
 LOOKED_AT = 40_000  # upper limit of texels, evenly over the sets: enough for two digits
 
@@ -16,8 +17,6 @@ def light_left(
 ) -> BakedLight | None:
     """The albedo's dependence on surface direction and openness, from about `most` texels; None without covered
     texels."""
-    from mistyle.render.mitsuba.occlusion import ambient_occlusion
-
     covered = sum(int(texels.covered.sum()) for texels in sets)
     if covered == 0:
         return None

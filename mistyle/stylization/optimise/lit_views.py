@@ -21,6 +21,10 @@ from mistyle.core.light import Lights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+from mistyle.render.mitsuba.draw import tracer
+from mistyle.render.mitsuba.unlit import unlit
 from mistyle.solver.recover import Recovered, recover
 from mistyle.solver.texels.solve import shrunk_maps
 from mistyle.stylization.mvst.unlight import BOUND, LEAST, STROKE, blurred
@@ -170,11 +174,6 @@ def _explained(
     mesh: Mesh, captures: Captures, both: tuple[Sequence[Maps], Sequence[Maps]], targets: Sequence[View]
 ) -> tuple[tuple[float, float], list[View]]:
     """The residuals of two solutions, and the unlit views by the second one."""
-    from mistyle.render.deferred.material_table import pack
-    from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
-    from mistyle.render.mitsuba.draw import tracer
-    from mistyle.render.mitsuba.unlit import unlit
-
     traced, sizes = tracer(mesh), [m.roughness.shape for m in both[0]]
     options = RenderOptions(subsamples=SUBSAMPLES, gradients=False)
     renderer = MaterialRenderer(traced, captures, sizes, options)

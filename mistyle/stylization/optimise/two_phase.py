@@ -36,6 +36,7 @@ from mistyle.core.mesh import Mesh, face_areas
 from mistyle.core.view import View
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.stylization.optimise import judge as fit_judge
 from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise.phase import CropBatch, Loss, Phase, PhaseRunner, SceneContext
@@ -240,7 +241,6 @@ def _pictures(targets: Sequence[View]) -> tuple[Any, ...]:
 
 def _scene(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> SceneContext:
     from mistyle.measure.features import load_features
-    from mistyle.render.mitsuba.draw import tracer
 
     return SceneContext(
         traced=tracer(mesh),

@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 from mistyle.core.asset import Picture
 from mistyle.core.mesh import Mesh
+from mistyle.render.mitsuba.draw import tracer
+from mistyle.render.mitsuba.occlusion import ambient_occlusion
 from mistyle.stylization.surface.guides.guides import Content, Occlusion
 from mistyle.stylization.surface.guides.linefield import DirectionConstraint
 from mistyle.stylization.surface.lookup import PaintedSurface
@@ -12,9 +14,6 @@ from mistyle.stylization.surface.settings import ResolvedSettings, SurfaceSettin
 
 def open_sky(mesh: Mesh, seed: int) -> Occlusion:
     """A function for the share of open sky at points of a mesh; builds the ray-tracing structure once."""
-    from mistyle.render.mitsuba.draw import tracer
-    from mistyle.render.mitsuba.occlusion import ambient_occlusion
-
     traced = tracer(mesh)
     return lambda positions, normals: ambient_occlusion(traced, positions, normals, seed=seed)
 
