@@ -35,7 +35,7 @@ def surface(scene: Scene) -> Row:
     from mistyle.core.maps import flat_maps
     from mistyle.stylization.pipeline.painting import painted, unlit_views
     from mistyle.stylization.records import Atlas
-    from mistyle.stylization.surface.surface_painter import solve_surface
+    from mistyle.stylization.surface.painter import solve_surface
 
     start, asset = time.perf_counter(), scene.asset
     solution = solve_surface(asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
@@ -100,7 +100,7 @@ def swept(scene: Scene) -> Row:
 
 def view_stylizer(scene: Scene):
     """The embedded stylizer view by view."""
-    from mistyle.stylization.surface.view_painter import stylizer
+    from mistyle.stylization.surface.painter import stylizer
 
     return stylizer(scene.asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
 

@@ -102,7 +102,7 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
 def guided(asset: Asset, picture: Picture, settings: Settings, views: Sequence[View]):
     """Colour and detail guide of every view's pixels, and the painting at the size at which views show it."""
     from mistyle.stylization.surface.kernels import module
-    from mistyle.stylization.surface.surface_painter import open_sky
+    from mistyle.stylization.surface.painter import open_sky
     from mistyle.stylization.surface.synthesis import SurfaceFields, finest_size, mesh_guides
 
     dj, fields = module(), SurfaceFields(open_sky(asset.mesh, settings.seed))

@@ -177,7 +177,7 @@ def test_the_heights_gradient_is_the_reliefs(tmp_path):
     from mistyle.deliver.colour import read_style
     from mistyle.stylization.settings import Settings
     from mistyle.stylization.surface.lookup import height, relief
-    from mistyle.stylization.surface.surface_painter import solve_surface
+    from mistyle.stylization.surface.painter import solve_surface
 
     trimesh.creation.icosphere(subdivisions=4).export(tmp_path / "ball.obj")
     y, x = np.mgrid[:384, :512] / 64

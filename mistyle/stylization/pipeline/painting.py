@@ -56,7 +56,7 @@ def paint(
     direction: DirectionConstraint | None = None,
 ) -> PaintedSurface:
     """Paint the surface with one picture; `content`: lightness of its own texture; `direction`: that of strokes."""
-    from mistyle.stylization.surface.surface_painter import solve_surface
+    from mistyle.stylization.surface.painter import solve_surface
 
     return solve_surface(
         asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, direction=direction

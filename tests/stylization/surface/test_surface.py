@@ -631,7 +631,7 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     import trimesh
 
     from mistyle.core.asset import Picture
-    from mistyle.stylization.surface.surface_painter import solve_surface
+    from mistyle.stylization.surface.painter import solve_surface
 
     loaded = trimesh.load(data("meshes/plain/spot.obj"), force="mesh")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
