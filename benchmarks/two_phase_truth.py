@@ -16,7 +16,7 @@ from jaxtyping import Float
 from benchmarks.material_metrics import texel_areas
 from benchmarks.recovery_pictures import Shot, render
 from mistyle.atlas.bake import backproject, fill
-from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.settings import BakeSettings
 from mistyle.atlas.texels import pad
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.camera import Camera, rig

@@ -1,4 +1,4 @@
-"""User settings of the texture sets."""
+"""User settings of the texture sets, and of baking views into them."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -10,3 +10,19 @@ class AtlasSettings(BaseModel):
 
     size: int = Field(default=2048, ge=16, le=16384, description="texels along each side of every texture set")
     padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are extended outwards")
+
+
+class BakeSettings(BaseModel):
+    """Acceptance of a view for a texel (paper 4.1.4)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    depth_tolerance: float = Field(
+        default=0.05, gt=0, le=1, description="largest difference between a texel's and the view's depth"
+    )
+    window: int = Field(
+        default=5,
+        ge=1,
+        le=31,
+        description="side in pixels of the window in which a silhouette pixel takes its pure colour",
+    )

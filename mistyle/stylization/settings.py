@@ -7,8 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from mistyle.atlas.bake_settings import BakeSettings
-from mistyle.atlas.settings import AtlasSettings
+from mistyle.atlas.settings import AtlasSettings, BakeSettings
 from mistyle.core.rig_settings import RigSettings
 from mistyle.jobs import settings
 from mistyle.jobs.deliver_settings import ColourSettings, DeliverSettings

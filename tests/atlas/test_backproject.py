@@ -9,7 +9,7 @@ from helpers import data
 
 from mistyle.atlas import bake as stage
 from mistyle.atlas.bake import Backprojection, backproject, bake, fill, pure_colours
-from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.settings import BakeSettings
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, look_at, orbit, pixel_centres, px_from_world, rig
 from mistyle.core.image import bilinear, linear_from_srgb
