@@ -50,28 +50,6 @@ class Angles(NamedTuple):
     valid: Any
 
 
-def principled(wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5) -> Any:
-    """f cos(theta_o) of Mitsuba 3.9.1's `principled` with base_color, roughness, metallic, specular; one sided.
-
-    Burley diffuse and retro-reflection, not scaled by 1 - F; GGX with alpha = max(0.001, roughness²), separable Smith,
-    exact dielectric Fresnel of eta = 2 / (1 - sqrt(0.08 specular)) - 1, Schlick for the metal. With `specular` 0 plugin
-    and function have no specular reflection, not even for metals. Unlike the plugin's, the gradient by metallic at
-    exactly 1 includes the diffuse part.
-    """
-    return _reflected(_principled, wi, wo, albedo, roughness, metallic, specular)
-
-
-def gltf(wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5) -> Any:
-    """f cos(theta_o) of glTF 2.0's metallic-roughness material, appendix B.2: mix(dielectric, metal, metallic).
-
-    dielectric = mix(albedo / pi, D V, F(0.04)), metal = D V F(albedo); F(f0) = f0 + (1 - f0)(1 - |wi·h|)^5, D is GGX
-    with alpha = max(0.001, roughness²) (the specification leaves roughness 0 to the renderer), V height-correlated
-    Smith. `specular` / 0.5 scales the reflection of the dielectric; 0.5 is the specification. One sided. The
-    specification's second form, one Fresnel term for the mixed f0, differs where 0 < metallic < 1.
-    """
-    return _reflected(_gltf, wi, wo, albedo, roughness, metallic, specular)
-
-
 def evaluate(
     reflectance: Reflectance, wi: Any, wo: Any, normal: Any, albedo: Any, roughness: Any, metallic: Any
 ) -> Any:
@@ -110,9 +88,12 @@ def upright(wi: Any, wo: Any) -> Angles:
     return _angles((0, 0, 1), (wi.x, wi.y, wi.z), (wo.x, wo.y, wo.z), True)
 
 
-def _reflected(lobes: Callable, wi, wo, albedo, roughness, metallic, specular: float) -> Any:
+def from_front(
+    model: str, wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5
+) -> Any:
+    """f cos(theta_o) of one of MODELS, one sided, without a normal map."""
     angles = upright(wi, wo)
-    linear, constant = lobes(angles, roughness, metallic, specular)
+    linear, constant = MODELS[model](angles, roughness, metallic, specular)
     return dr.fma(albedo, dr.select(angles.valid, linear, 0), dr.select(angles.valid, constant, 0))
 
 
@@ -135,6 +116,13 @@ def _angles(n: tuple, wi: tuple, wo: tuple, valid: Any) -> Angles:
 
 
 def _principled(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[Any, Any]:
+    """Mitsuba 3.9.1's `principled` with base_color, roughness, metallic, specular.
+
+    Burley diffuse and retro-reflection, not scaled by 1 - F; GGX with alpha = max(0.001, roughness²), separable Smith,
+    exact dielectric Fresnel of eta = 2 / (1 - sqrt(0.08 specular)) - 1, Schlick for the metal. With `specular` 0 plugin
+    and function have no specular reflection, not even for metals. Unlike the plugin's, the gradient by metallic at
+    exactly 1 includes the diffuse part.
+    """
     dielectric = 1 - metallic
     fi, fo = _schlick(a.cos_i), _schlick(a.cos_o)
     retro = 2 * dr.square(a.cos_d) * roughness
@@ -152,6 +140,13 @@ def _principled(a: Angles, roughness: Any, metallic: Any, specular: float) -> tu
 
 
 def _gltf(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[Any, Any]:
+    """glTF 2.0's metallic-roughness material, appendix B.2: mix(dielectric, metal, metallic).
+
+    dielectric = mix(albedo / pi, D V, F(0.04)), metal = D V F(albedo); F(f0) = f0 + (1 - f0)(1 - |wi·h|)^5, D is GGX
+    with alpha = max(0.001, roughness²) (the specification leaves roughness 0 to the renderer), V height-correlated
+    Smith. `specular` / 0.5 scales the reflection of the dielectric; 0.5 is the specification. The specification's
+    second form, one Fresnel term for the mixed f0, differs where 0 < metallic < 1.
+    """
     edge, lobe = _schlick(a.cos_d), _lobe(a, _alpha2(roughness))
     tint, white = _metal(lobe, metallic, edge)
     fresnel = (2 * specular) * dr.fma(1 - GLTF_F0, edge, GLTF_F0)
@@ -166,7 +161,7 @@ def layered(
 
     `albedo` and `f0` (of the dielectric) are colours; F(f0) = f0 + (f90 - f0)(1 - |wi·h|)^5, and the diffuse lobe loses
     its largest channel. `coat` is (strength, roughness); of index 1.5, it covers the base by its Fresnel term at the
-    normal. With f0 = 0.04, f90 = 1 and no coat it is `gltf`. Finite where `a.valid` is False.
+    normal. With f0 = 0.04, f90 = 1 and no coat it is `_gltf`. Finite where `a.valid` is False.
     """
     edge = _schlick(a.cos_d)
     lobe = _lobe(a, _alpha2(roughness))

@@ -88,8 +88,7 @@ def _pages_class() -> type:
         def eval(self, si, active=True):
             return mi.Color3f(self._lookup(si, active))
 
-        def eval_3(self, si, active=True):
-            return mi.Color3f(self._lookup(si, active))
+        eval_3 = eval
 
         def eval_1(self, si, active=True):
             return self._lookup(si, active)

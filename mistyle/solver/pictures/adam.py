@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT_X, TILT_Y
@@ -50,7 +50,7 @@ class Descent:
     """Moments of every level of every texture set's pyramid, and the step.
 
     `rates` are factors of the rate per channel of the table (8; 0 freezes a channel), `shares` further factors by texel
-    and channel; `still` marks frozen texels.
+    and channel.
     """
 
     def __init__(
@@ -59,7 +59,6 @@ class Descent:
         rates: Sequence[float],
         options: AdamOptions = DEFAULT_OPTIONS,
         *,
-        still: Bool[np.ndarray, " t"] | None = None,
         shares: Float[np.ndarray, "t 8"] | None = None,
     ) -> None:
         device.use()
@@ -70,10 +69,7 @@ class Descent:
         widths = [rows * columns for pyramid in self.pyramids for rows, columns in pyramid]
         self.moments = [[mi.Float(aligned(np.zeros(8 * n))) for n in widths] for _ in range(2)]
         self.ages = [mi.Float(aligned(np.zeros(n))) for n in widths]
-        free = np.full(self.texels, FINE, np.uint32)
-        if still is not None:
-            free[still] = FINE - 1
-        self.blame = mi.UInt32(aligned(free, np.uint32))
+        self.blame = mi.UInt32(aligned(np.full(self.texels, FINE), np.uint32))
         self.shares = [] if shares is None else [mi.Float(aligned(shares.ravel()))]
         self._run = device.Frozen(self._step)
 
@@ -103,7 +99,7 @@ class Descent:
     def stopped(self) -> list[tuple[int, str, int]]:
         """(texel, map, picture) of every texel whose gradient was not finite."""
         blame: Int[np.ndarray, " t"] = np.array(self.blame)
-        bad = np.flatnonzero(blame < FINE - 1)
+        bad = np.flatnonzero(blame < FINE)
         return [(int(k), CHANNELS[int(blame[k]) % 8], int(blame[k]) // 8) for k in bad]
 
     def _step(self, table, gradient, state, shares, rate, picture) -> Any:

@@ -134,17 +134,15 @@ def solve(
     return Solved(tuple(start), fitted, tuple(unlit), residual, trace, recovered.notes)
 
 
-def laid(
-    maps: Sequence[Maps], start: Sequence[Maps], solved: Sequence[Maps], names: Sequence[str] = DESCRIBED
-) -> list[Maps]:
-    """`maps` plus the change from `start` to `solved` in the fields `names`.
+def laid(maps: Sequence[Maps], start: Sequence[Maps], solved: Sequence[Maps]) -> list[Maps]:
+    """`maps` plus the change from `start` to `solved`.
 
     `start` and `solved` have the solution's coarser resolution; `start` is the shrunk `maps`. Finer detail stays.
     """
     result = []
     for fine, before, after in zip(maps, start, solved, strict=True):
         size, fields = fine.roughness.shape, {}
-        for name in names:
+        for name in DESCRIBED:
             change = (getattr(after, name) - getattr(before, name)).astype(np.float32)
             if change.any():
                 moved = getattr(fine, name) + (change if change.shape[:2] == size else resize(change, size))

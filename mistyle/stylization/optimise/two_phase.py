@@ -23,7 +23,6 @@ Both phases are evaluated afterwards (`optimise/judge.py`), and undone where the
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,7 @@ from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Lights, lights
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
+from mistyle.core.stage_progress import StageProgress
 from mistyle.core.view import View
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
@@ -141,15 +141,10 @@ def two_phase(
                     evaluation = fit_judge.build_evaluation(scene.traced, scene.tangents, unlit)
             with memory.kept():
                 runner = PhaseRunner(scene, table, phase, settings, rng)
-                report = partial(_report, progress, done / total, phase.iterations / total)
-                fit = _one_phase(runner, fit, first, start.only, evaluation, report)
+                part = StageProgress(progress, done / total, (done + phase.iterations) / total)
+                fit = _one_phase(runner, fit, first, start.only, evaluation, part)
             done += phase.iterations
     return fit
-
-
-def _report(progress: Callable[[float], None], begin: float, length: float, done: float) -> None:
-    """Report progress within an interval of the total."""
-    progress(begin + length * done)
 
 
 def _one_phase(
