@@ -8,8 +8,8 @@ from mistyle.core.asset import Picture
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
+from mistyle.render.mitsuba import occlusion
 from mistyle.render.mitsuba.draw import tracer
-from mistyle.render.mitsuba.occlusion import ambient_occlusion
 from mistyle.stylization.mvst.sweep import Stylizer
 from mistyle.stylization.surface import kernels
 from mistyle.stylization.surface.guides.guides import Content, Occlusion
@@ -23,7 +23,7 @@ from mistyle.stylization.surface.view_samples import paint_view
 def open_sky(mesh: Mesh, seed: int) -> Occlusion:
     """A function for the share of open sky at points of a mesh; builds the ray-tracing structure once."""
     traced = tracer(mesh)
-    return lambda positions, normals: ambient_occlusion(traced, positions, normals, seed=seed)
+    return lambda positions, normals: occlusion.open_sky(traced, positions, normals, seed=seed)[:, 3].copy()
 
 
 def solve_surface(
