@@ -13,7 +13,7 @@ from mistyle.atlas.settings import BakeSettings
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, pixel_centres, rig
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 
 # Centre and radius.

@@ -12,7 +12,7 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.core.camera import Camera, orbit
 from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels, flat_maps
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.io.store.records import load_record, save_record
 from mistyle.stylization.settings import Settings, resolve

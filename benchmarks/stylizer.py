@@ -26,7 +26,7 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     import numpy as np
 
     from mistyle.core.camera import rig
-    from mistyle.core.rig_settings import RigSettings
+    from mistyle.core.settings import RigSettings
     from mistyle.core.view import View
     from mistyle.io.read import read_picture
     from mistyle.io.store.records import load_record

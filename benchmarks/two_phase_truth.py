@@ -23,7 +23,7 @@ from mistyle.core.camera import Camera, rig
 from mistyle.core.image import nearest_fill
 from mistyle.core.light import SOFT, Environment, Lights, bake_environment
 from mistyle.core.maps import Maps, Texels
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.stylization.pipeline import painting

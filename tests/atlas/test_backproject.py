@@ -15,7 +15,7 @@ from mistyle.core.camera import Camera, look_at, orbit, pixel_centres, px_from_w
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 
 SETTINGS = BakeSettings()

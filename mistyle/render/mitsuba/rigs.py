@@ -9,7 +9,7 @@ from jaxtyping import Float
 from mistyle.core.camera import Camera
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.geometry.next_best_view import candidate_cameras, choose
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.render.mitsuba.visible import face_on
