@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks.common import arguments, finish, peak_gb, timed
 from mistyle.atlas.bake import bake
-from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.settings import BakeSettings
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, pixel_centres, rig
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 
 # Centre and radius.

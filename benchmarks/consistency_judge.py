@@ -46,7 +46,7 @@ def judged(
     figures = warps(views, pictures) | likeness(scene, pictures, masks)
     shapes = [np.repeat(0.5 + 0.25 * d[..., None], 3, axis=-1) for d in scene.detail]
     figures["detail_corr"] = consistency.guide_correlation(pictures, scene.detail, masks)
-    figures["clay_corr"] = mean(map(metrics.detail_correlation, pictures, scene.clay, masks))
+    figures["clay_corr"] = mean(map(consistency.detail_correlation, pictures, scene.clay, masks))
     figures["edge_recall_over_chance"] = mean(map(consistency.edge_recall, pictures, shapes, masks))
     figures["covered"] = 1.0
     if albedo is None:
@@ -82,8 +82,9 @@ def likeness(scene: Scene, pictures: Sequence[np.ndarray], masks: Sequence[np.nd
 
 def style_figures(pictures, masks, style, style_masks) -> dict[str, float]:
     """patch_swd, gram_vgg, and their sum."""
-    patch = metrics.patch_distance(pictures, masks, style, style_masks)
-    gram = metrics.gram_distance(pictures, masks, style, style_masks, features=load_features(VGG))
+    patch, features = metrics.PatchReference(masks, style, style_masks).distance(pictures), load_features(VGG)
+    mine, theirs = metrics.pooled_gram(pictures, masks, features), metrics.pooled_gram(style, style_masks, features)
+    gram = metrics.gram_distance(mine, theirs)
     return {"patch_swd": patch, "gram_vgg": gram, "style_distance": patch + 10 * gram}
 
 

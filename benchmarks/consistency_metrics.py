@@ -15,6 +15,7 @@ from mistyle.core.image import dilate, erode, gaussian
 from mistyle.core.view import View
 from mistyle.measure.colour_difference import lab
 from mistyle.measure.lpips import Lpips
+from mistyle.measure.metrics import band_correlation, detail
 from mistyle.measure.overlap import DEPTH_TOLERANCE, Overlap, overlap, seen_here, seen_there
 
 # Degrees between the cameras of a pair: neighbours, and a part of the way round.
@@ -93,6 +94,13 @@ def _shared(views: Sequence[View], chosen: Sequence[Pair]) -> Iterator[tuple[int
         shared = overlap(views[i], views[j])
         if shared.both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
             yield i, j, shared
+
+
+def detail_correlation(
+    picture: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
+) -> float:
+    """Correlation of the pictures' `detail` over the mask."""
+    return band_correlation(detail(picture, mask), detail(reference, mask), mask)
 
 
 def guide_correlation(

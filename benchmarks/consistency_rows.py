@@ -35,7 +35,7 @@ def surface(scene: Scene) -> Row:
     from mistyle.core.maps import flat_maps
     from mistyle.stylization.pipeline.painting import painted, unlit_views
     from mistyle.stylization.records import Atlas
-    from mistyle.stylization.surface.surface_painter import solve_surface
+    from mistyle.stylization.surface.painter import solve_surface
 
     start, asset = time.perf_counter(), scene.asset
     solution = solve_surface(asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
@@ -52,7 +52,7 @@ def without_atlas(scene: Scene, solution: Any) -> list[np.ndarray]:
     from mistyle.core.camera import resized
     from mistyle.render.mitsuba.draw import gbuffer, tracer
     from mistyle.render.mitsuba.unlit import FINE
-    from mistyle.stylization.surface.surface_painter import surface_colour
+    from mistyle.stylization.surface.lookup import colour
 
     traced, pictures = tracer(scene.asset.mesh), []
     for view in scene.views:
@@ -61,7 +61,7 @@ def without_atlas(scene: Scene, solution: Any) -> list[np.ndarray]:
         rgb = np.zeros((*hits.mask.shape, 3), np.float32)
         side = scene.settings.rig.distance / view.camera.focal / FINE
         at = hits.mask
-        rgb[at] = linear_from_srgb(surface_colour(solution, hits.position[at], hits.normal[at], footprint=side))
+        rgb[at] = linear_from_srgb(colour(solution, hits.position[at], hits.normal[at], footprint=side))
         rgb = rgb.reshape(height, FINE, width, FINE, 3).mean(axis=(1, 3))
         share = at.reshape(height, FINE, width, FINE).mean(axis=(1, 3), dtype=np.float32)
         pictures.append(encoded(replace(view, rgb=rgb, coverage=share)))
@@ -100,7 +100,7 @@ def swept(scene: Scene) -> Row:
 
 def view_stylizer(scene: Scene):
     """The embedded stylizer view by view."""
-    from mistyle.stylization.surface.view_painter import stylizer
+    from mistyle.stylization.surface.painter import stylizer
 
     return stylizer(scene.asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
 

@@ -12,7 +12,7 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.core.camera import Camera, orbit
 from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels, flat_maps
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.io.store.records import load_record, save_record
 from mistyle.stylization.settings import Settings, resolve
@@ -102,10 +102,10 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
 def guided(asset: Asset, picture: Picture, settings: Settings, views: Sequence[View]):
     """Colour and detail guide of every view's pixels, and the painting at the size at which views show it."""
     from mistyle.stylization.surface.kernels import module
-    from mistyle.stylization.surface.surface_painter import array_module, open_sky
+    from mistyle.stylization.surface.painter import open_sky
     from mistyle.stylization.surface.synthesis import SurfaceFields, finest_size, mesh_guides
 
-    dj, fields = module(array_module()), SurfaceFields(open_sky(asset.mesh, settings.seed))
+    dj, fields = module(), SurfaceFields(open_sky(asset.mesh, settings.seed))
     chosen = settings.surface
     base = mesh_guides(asset.mesh, picture, fields, chosen, settings.seed, dj)
     points, guide, painting = base.levels[-1].points, base.guides[-1], base.picture

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 from benchmarks.common import finish, parser
 from mistyle.core.camera import Camera, orbit, px_from_world, rig
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.solver.shape.checks import flipped, new_intersections, start_of
 from mistyle.solver.shape.displace import TargetOutline, displace

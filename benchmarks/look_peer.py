@@ -50,7 +50,7 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     from benchmarks.consistency_scene import guided
     from mistyle.core.camera import rig
     from mistyle.core.image import linear_from_srgb
-    from mistyle.core.rig_settings import RigSettings
+    from mistyle.core.settings import RigSettings
     from mistyle.io.cameras.views import write_views
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh

@@ -26,7 +26,7 @@ from mistyle.core.light import (
 )
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.io.read import read_hdr
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.scene import Frame, object_shapes, passes, sensor_dict

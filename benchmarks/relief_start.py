@@ -18,7 +18,7 @@ from PIL import Image
 from benchmarks.common import finish, timed
 from mistyle.core.camera import rig
 from mistyle.core.image import srgb_from_linear
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh

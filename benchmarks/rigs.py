@@ -18,7 +18,7 @@ from benchmarks.common import finish, timed
 from mistyle.core.camera import Camera, rig
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.geometry.next_best_view import candidate_cameras, overlaps, visit
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

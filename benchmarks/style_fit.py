@@ -63,7 +63,7 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     from mistyle.render.mitsuba.draw import gbuffer, tracer
     from mistyle.stylization.pipeline import painting
     from mistyle.stylization.pipeline import start as stylize_start
-    from mistyle.stylization.surface.surface_painter import surface_colour
+    from mistyle.stylization.surface.lookup import colour
 
     def silent(done: float) -> None:
         pass
@@ -77,7 +77,7 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     for part, (texels, own) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
         albedo, at = np.zeros_like(own.albedo), texels.covered
         side = painting.texel_side(asset, part, texels)
-        painted = surface_colour(solution, texels.position[at], texels.normal[at], footprint=side)
+        painted = colour(solution, texels.position[at], texels.normal[at], footprint=side)
         albedo[at] = linear_from_srgb(painted)
         maps.append(replace(own, albedo=albedo, known=texels.covered))
     traced, views = tracer(asset.mesh), []

@@ -26,7 +26,7 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     import numpy as np
 
     from mistyle.core.camera import rig
-    from mistyle.core.rig_settings import RigSettings
+    from mistyle.core.settings import RigSettings
     from mistyle.core.view import View
     from mistyle.io.read import read_picture
     from mistyle.io.store.records import load_record
@@ -34,7 +34,7 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     from mistyle.stylization.pipeline import painting
     from mistyle.stylization.pipeline import start as stylize_start
     from mistyle.stylization.settings import resolve
-    from mistyle.stylization.surface.surface_painter import solve_surface
+    from mistyle.stylization.surface.painter import solve_surface
 
     settings = resolve(
         None, None, {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}

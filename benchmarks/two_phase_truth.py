@@ -16,14 +16,14 @@ from jaxtyping import Float
 from benchmarks.material_metrics import texel_areas
 from benchmarks.recovery_pictures import Shot, render
 from mistyle.atlas.bake import backproject, fill
-from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.settings import BakeSettings
 from mistyle.atlas.texels import pad
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.camera import Camera, rig
 from mistyle.core.image import nearest_fill
 from mistyle.core.light import SOFT, Environment, Lights, bake_environment
 from mistyle.core.maps import Maps, Texels
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.stylization.pipeline import painting
@@ -56,7 +56,7 @@ def silent(done: float) -> None:
 
 def painted(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, slope: float, seed: int) -> Painted:
     """The object painted with `style`; `slope` is the true relief's root mean square slope."""
-    from mistyle.stylization.surface.surface_painter import surface_relief
+    from mistyle.stylization.surface.lookup import relief
 
     layers = painting.paint_layers(asset, style, atlas, settings, silent)
     flat, painter = painting.raised(asset, layers, atlas, settings)
@@ -64,7 +64,7 @@ def painted(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, slop
     for part, (texels, maps) in enumerate(zip(atlas.texels, flat, strict=True)):
         side = painting.texel_side(asset, part, texels)
         place = texels.position[texels.covered], texels.normal[texels.covered]
-        guessed = surface_relief(layers.solutions[0], *place, footprint=side)[0]
+        guessed = relief(layers.solutions[0], *place, footprint=side)[0]
         truth.append(true_maps(asset, texels, maps, guessed, side, slope, np.random.default_rng([seed, part])))
     areas = tuple(texel_areas(asset.mesh, texels) for texels in atlas.texels)
     return Painted(asset, atlas, tuple(truth), tuple(flat), tuple(painter), areas)

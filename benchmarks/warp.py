@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.bake import SPHERES, draw
 from benchmarks.common import arguments, finish, peak_gb, timed
 from mistyle.core.camera import pixel_centres, rig, world_from_px
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.stylization.mvst.settings import WarpSettings
 from mistyle.stylization.mvst.warp import composite, lift, splat

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.atlas.bake_settings import BakeSettings
 from mistyle.atlas.gaps import fill_in_place
+from mistyle.atlas.settings import BakeSettings
 from mistyle.atlas.texels import pad_in_place, threaded
 from mistyle.core.camera import Camera
 from mistyle.core.maps import Texels

@@ -25,10 +25,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.names import ASSET, distinct, safe_name
+from mistyle.core.settings import FrozenModel
 from mistyle.io.read_mesh import MESHES
 from mistyle.jobs.inputs import input_files
 from mistyle.jobs.settings import merge, validate
@@ -38,10 +39,8 @@ MOST_JOBS = 100_000
 MOST_LISTED = 20
 
 
-class BatchJob(BaseModel):
+class BatchJob(FrozenModel):
     """One job of a jobs file: a mesh with a style picture, or with references for a fit."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mesh: Path
     style: Path | None = None
@@ -54,10 +53,8 @@ class BatchJob(BaseModel):
     settings: dict[str, Any] = Field(default={}, description="nested, or with dotted names as for --set")
 
 
-class Grid(BaseModel):
+class Grid(FrozenModel):
     """Every mesh with every style, preset and variant."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     meshes: list[str] = Field(min_length=1)
     styles: list[str] = Field(min_length=1)
@@ -65,10 +62,8 @@ class Grid(BaseModel):
     variants: list[dict[str, Any]] = []
 
 
-class JobsFile(BaseModel):
+class JobsFile(FrozenModel):
     """A jobs file; `preset` and `settings` are the defaults of every job."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: str = "standard"
     settings: dict[str, Any] = {}
@@ -79,10 +74,8 @@ class JobsFile(BaseModel):
 Kind = Literal["stylize", "fit"]
 
 
-class Record(BaseModel):
+class Record(FrozenModel):
     """One resolved job for `mistyle shard`. Paths are absolute, settings complete."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     kind: Kind

@@ -189,10 +189,12 @@ def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"
 
 
 def bake_environment(rig: Sequence[Light], height: int = 128) -> Float[np.ndarray, "h w 3"]:
-    """Latitude-longitude radiance (width twice the height) of spherical Gaussians, ambient light and environments.
+    """Latitude-longitude radiance (width twice the height) of soft lights; ValueError for others."""
+    return soft_radiance(rig, environment_directions(height, 2 * height)).astype(np.float32)
 
-    ValueError for other lights."""
-    directions = environment_directions(height, 2 * height)
+
+def soft_radiance(rig: Sequence[Light], directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Radiance of soft lights from unit world directions; ValueError for other lights."""
     total = np.zeros(directions.shape)
     for light in rig:
         if isinstance(light, SphericalGaussian):
@@ -202,8 +204,8 @@ def bake_environment(rig: Sequence[Light], height: int = 128) -> Float[np.ndarra
         elif isinstance(light, Environment):
             total += environment_radiance(light, directions)
         else:
-            raise ValueError(f"cannot bake {type(light).__name__} into an environment map")
-    return total.astype(np.float32)
+            raise ValueError(f"{type(light).__name__} is not a soft light")
+    return total
 
 
 def to_json(rig: Lights, views: Mapping[str, Lights] | None = None) -> dict[str, Any]:

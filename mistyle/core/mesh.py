@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.rows import corner_rows, distinct
+from mistyle.core.rows import corner_rows, distinct, unit
 
 # Distance from the origin, in radii, beyond which float32 rounds visibly: by 4 mm for 10 km of terrain at 80 km.
 FAR = 8.0
@@ -70,9 +70,7 @@ def local_origin(positions: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, " 3"]
 def face_normals(mesh: Mesh) -> Float[np.ndarray, "f 3"]:
     """Unit geometric normal of every face (counter-clockwise front); zero for degenerate faces."""
     a, b, c = (mesh.positions[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    n = np.cross(b - a, c - a)
-    length = np.linalg.norm(n, axis=1, keepdims=True)
-    return n / np.where(length > 0, length, 1)
+    return unit(np.cross(b - a, c - a))
 
 
 def face_areas(mesh: Mesh) -> Float[np.ndarray, " f"]:
@@ -98,10 +96,8 @@ def spread_points(
     over = u + v > 1
     u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
     a, b, c = (positions[faces[face, k]].astype(np.float64) for k in range(3))
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
     position = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-    return SpreadPoints(position, normal / np.where(length > 0, length, 1))
+    return SpreadPoints(position, unit(np.cross(b - a, c - a)))
 
 
 def surface_of(positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> SpreadPoints:

@@ -1,4 +1,4 @@
-"""Rows of a table: distinct ones, evenly chosen ones, and medians of groups."""
+"""Rows of a table: distinct ones, evenly chosen ones, unit ones, and sums and medians of groups."""
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
@@ -28,6 +28,17 @@ def distinct(rows: Shaped[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " d"], In
 def evenly(count: int, most: int) -> list[int]:
     """At most `most` of the rows 0..count - 1, evenly chosen, the first and the last among them."""
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
+
+
+def unit(rows: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
+    """The rows at length one; zero stays zero."""
+    length = np.linalg.norm(rows, axis=-1, keepdims=True)
+    return rows / np.where(length > 0, length, 1)
+
+
+def sums(group: Int[np.ndarray, " n"], rows: Float[np.ndarray, "n k"], count: int) -> Shaped[np.ndarray, "g k"]:
+    """The sum of the rows of each group 0..count - 1; integers where there is none."""
+    return np.stack([np.bincount(group, column, count) for column in rows.T], axis=1)
 
 
 def weighted_median(values: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"]) -> float:

@@ -5,7 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.rows import unit
 from mistyle.geometry.normals import area_vectors
+from mistyle.geometry.uvs import corner_nodes, group_rows
 
 NEIGHBOURS = 12
 CHUNK = 200_000
@@ -44,8 +46,8 @@ def transfer(
     """
     tree, sample_face = _samples(proxy_positions, proxy_faces)
     corners = proxy_positions[proxy_faces].astype(np.float64)
-    unit = _unit(area_vectors(proxy_positions, proxy_faces))
-    home = _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick)
+    normals = unit(area_vectors(proxy_positions, proxy_faces))
+    home = _nearest_faces(positions, faces, tree, sample_face, corners, normals, tick)
     home = _smooth(home, proxy_chart, faces)
     chart = proxy_chart[home]
     # One entry per (vertex, chart) in use; the home face of one of its corners is a candidate that always fits.
@@ -91,7 +93,7 @@ def _samples(positions: np.ndarray, faces: np.ndarray):
     return KDTree(a + (b - a) * s[:, None] + (c - a) * t[:, None]), face
 
 
-def _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick) -> Int[np.ndarray, " f"]:
+def _nearest_faces(positions, faces, tree, sample_face, corners, normals, tick) -> Int[np.ndarray, " f"]:
     """The proxy face that lies nearest to each face's middle; a different orientation adds distance."""
     result = np.empty(len(faces), np.int64)
     reach = np.sqrt(
@@ -102,8 +104,8 @@ def _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick) -> 
         middle = positions[part].mean(axis=1).astype(np.float64)
         candidates = sample_face[tree.query(middle, k=NEIGHBOURS)[1]]
         distance = closest(middle[:, None], corners[candidates])[1]
-        direction = _unit(area_vectors(positions, part))
-        turned = 1 - np.einsum("nc,nkc->nk", direction, unit[candidates])
+        direction = unit(area_vectors(positions, part))
+        turned = 1 - np.einsum("nc,nkc->nk", direction, normals[candidates])
         best = (distance + (0.5 * reach * turned) ** 2).argmin(axis=1)
         result[start : start + CHUNK] = candidates[np.arange(len(part)), best]
         tick()
@@ -113,8 +115,6 @@ def _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick) -> 
 def _smooth(home: Int[np.ndarray, " f"], chart: Int[np.ndarray, " g"], faces: Int[np.ndarray, "f 3"]) -> np.ndarray:
     """Majority vote over the three neighbours' charts, SMOOTHING times: borders become straighter, and single faces
     do not become charts."""
-    from mistyle.geometry.uvs import group_rows
-
     a, b = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)
     edge = group_rows(np.maximum(a, b), np.minimum(a, b))
     order = np.argsort(edge, kind="stable")
@@ -173,14 +173,7 @@ def _barycentric(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def _border(faces: np.ndarray, uvs: np.ndarray, chart: np.ndarray) -> Bool[np.ndarray, "g 3"]:
     """Whether the edge opposite to each corner is a border of its chart: no other face of the chart continues there
     with the same UVs."""
-    from mistyle.geometry.uvs import corner_nodes, group_rows
-
     nodes = corner_nodes(faces, uvs)
     a, b = nodes[:, [1, 2, 0]].reshape(-1), nodes[:, [2, 0, 1]].reshape(-1)
     edge = group_rows(np.maximum(a, b), np.minimum(a, b), np.repeat(chart, 3))
     return (np.bincount(edge)[edge] == 1).reshape(-1, 3)
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(v, axis=-1, keepdims=True)
-    return v / np.where(length > 0, length, 1)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import Camera, orbit
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 
 GOLDEN_ANGLE = 180 * (3 - 5**0.5)
 STARTS = 8  # first views that are tried: those with the largest covered area

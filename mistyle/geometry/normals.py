@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.rows import sums, unit
+
 CREASE_DEGREES = 50.0
 # A corner compares every face around its vertex; beyond this many faces (poles, fans) it compares their sum.
 MAX_VALENCE = 128
@@ -50,17 +52,17 @@ def crease_normals(
     units = vectors / np.where(areas > 0, areas, 1)[:, None]
     corner_point = points[faces.reshape(-1)]
     count = int(corner_point.max(initial=-1)) + 1
-    around = _sum_by(corner_point, np.repeat(vectors, 3, axis=0), count)
+    around = sums(corner_point, np.repeat(vectors, 3, axis=0), count)
     valence = np.bincount(corner_point, minlength=count)
     total = around[corner_point]
     limit = np.cos(np.radians(degrees))
     own = np.repeat(units, 3, axis=0)
-    sharp = (_unit(total) * own).sum(axis=1) < limit
+    sharp = (unit(total) * own).sum(axis=1) < limit
     degenerate = np.repeat(areas == 0, 3)
     result = np.where((sharp & ~degenerate)[:, None], np.repeat(vectors, 3, axis=0), total)
     pairwise = ~degenerate & (valence[corner_point] <= MAX_VALENCE)
     _smooth_pairs(result, np.flatnonzero(pairwise), corner_point, valence, vectors, units, limit)
-    normals = _unit(result)
+    normals = unit(result)
     zero = ~normals.any(axis=1)
     normals[zero] = np.where(own[zero].any(axis=1, keepdims=True), own[zero], np.array([0.0, 1.0, 0.0]))
     return normals.reshape(-1, 3, 3).astype(np.float32)
@@ -89,17 +91,8 @@ def _smooth_pairs(
         step = np.arange(len(row)) - np.repeat(np.cumsum(n) - n, n)
         face = by_point[first[corner_point[chosen]][row] + step] // 3
         near = (units[chosen // 3][row] * units[face]).sum(axis=1) >= limit
-        result[chosen] = _sum_by(row[near], vectors[face[near]], len(chosen))
+        result[chosen] = sums(row[near], vectors[face[near]], len(chosen))
         start = stop
-
-
-def _sum_by(index: Int[np.ndarray, " n"], values: Float[np.ndarray, "n 3"], count: int) -> Float[np.ndarray, "m 3"]:
-    return np.stack([np.bincount(index, weights=values[:, k], minlength=count) for k in range(3)], axis=1)
-
-
-def _unit(v: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    length = np.linalg.norm(v, axis=1, keepdims=True)
-    return v / np.where(length > 0, length, 1)
 
 
 def usable_normals(normals: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, "f 3"]:

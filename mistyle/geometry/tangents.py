@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.mesh import Mesh, weld
+from mistyle.core.rows import sums
 
 _TINY = np.finfo(np.float32).tiny
 
@@ -204,7 +205,7 @@ def _group_tangents(corners, position, normal, frames: _Frames, group) -> tuple[
     tangent = _flattened(frames.tangent[face], n)
     number = int(group.max(initial=-1)) + 1
     index = group[face, corner]
-    total = np.stack([np.bincount(index, angle * tangent[:, k], minlength=number) for k in range(3)], axis=1)
+    total = sums(index, angle[:, None] * tangent, number)
     length = np.linalg.norm(total, axis=1)
     # A sum that cancels leaves rounding noise, not a direction.
     valid = length > 1e-6 * np.bincount(index, angle, minlength=number)

@@ -13,7 +13,9 @@ from jaxtyping import Float, Int
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.paths import PACKAGE
+from mistyle.geometry import decimated as proxy
 from mistyle.geometry.normals import area_vectors, same_points
+from mistyle.geometry.uvs import group_rows
 
 # Above this a decimated proxy is unwrapped and its UVs are transferred. xatlas's time grows with the faces' power 1.65
 # (bunny, 69,451 faces: 24 s) and its charts follow every bump. Through the proxy the bunny takes 5 s, has 109
@@ -49,8 +51,6 @@ def unwrap(
 
     `progress` receives a share estimated from the elapsed time: xatlas reports none. An interrupt ends the child.
     """
-    from mistyle.geometry import decimated as proxy
-
     padding = max(2, size // 256) if padding is None else padding
     jobs = [_clean(positions, faces) for positions, faces in meshes]
     seconds = sum(estimated_seconds(len(faces)) for _, faces in jobs)
@@ -100,8 +100,6 @@ def _clean(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _repeats(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
     """Number of earlier faces with the same three points."""
-    from mistyle.geometry.uvs import group_rows
-
     corners = np.sort(faces, axis=1)
     group = group_rows(corners[:, 2], corners[:, 1], corners[:, 0])
     order = np.argsort(group, kind="stable")

@@ -4,7 +4,9 @@ import re
 import string
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
+
+from mistyle.core.settings import FrozenModel
 
 FORMATS = ("glb", "usd", "mtlx", "obj", "maps")
 TEXTURES = "{asset}_{map}.{ext}"
@@ -62,10 +64,8 @@ Format = Literal["glb", "usd", "mtlx", "obj", "maps"]
 Program = Literal["blender", "unreal", "unity-urp", "unity-hdrp", "houdini", "arnold"]
 
 
-class DeliverSettings(BaseModel):
+class DeliverSettings(FrozenModel):
     """The files for other programs in OUT/delivered/<target>; none while all fields keep their defaults."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     formats: Annotated[tuple[Format, ...], BeforeValidator(listed)] = Field(
         default=(), description="glb, usd, mtlx, obj, maps (maps and glb where only a target is named)"
@@ -97,10 +97,8 @@ class DeliverSettings(BaseModel):
         return self.target or ("blender",)
 
 
-class ColourSettings(BaseModel):
+class ColourSettings(FrozenModel):
     """Colour spaces of inputs and outputs, by their OpenColorIO names; all computation is in linear Rec.709."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     space: str | None = Field(
         default=None,

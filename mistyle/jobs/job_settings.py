@@ -2,15 +2,15 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from mistyle.core.settings import FrozenModel
 
 LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks, below which a camera does not fit
 
 
-class ReadSettings(BaseModel):
+class ReadSettings(FrozenModel):
     """Settings of reading the mesh."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     uv: Literal["keep", "new", "auto"] = Field(
         default="auto", description="authored UVs: keep, replace, or replace where unusable"
@@ -21,10 +21,8 @@ class ReadSettings(BaseModel):
     lit: bool = Field(default=False, description="unlit glTF materials become lit ones in the asset")
 
 
-class ReportSettings(BaseModel):
+class ReportSettings(FrozenModel):
     """The pictures of the report."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     detail: Literal["none", "page", "full"] = Field(
         default="full",

@@ -45,11 +45,11 @@ def ambient(asset: Asset, part: int, size: int, seed: int, report: Report) -> np
     """Ambient occlusion of a texture set, computed at a quarter of the atlas: it has no finer detail than the mesh."""
     from mistyle.atlas.texels import pad, rasterise
     from mistyle.core.image import resize
-    from mistyle.render.mitsuba.occlusion import ambient_occlusion
+    from mistyle.render.mitsuba.occlusion import open_sky
 
     coarse = rasterise(asset.mesh, part, max(size // 4, 64))
     values = np.ones(coarse.covered.shape, np.float32)
     at = coarse.covered
-    values[at] = ambient_occlusion(asset.mesh, coarse.position[at], coarse.normal[at], seed=seed)
+    values[at] = open_sky(asset.mesh, coarse.position[at], coarse.normal[at], seed=seed)[:, 3]
     report((part + 1) / len(asset.mesh.parts))
     return np.clip(resize(pad(values, coarse, 8), (size, size)), 0, 1)

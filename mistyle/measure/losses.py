@@ -85,10 +85,8 @@ def crop_picture(picture: Float[torch.Tensor, "c h w"], crop: Crop, size: int) -
     return functional.grid_sample(picture[None], grid, mode="bilinear", padding_mode="border", align_corners=False)[0]
 
 
-def style_aligned(
-    maps: Sequence[torch.Tensor], targets: Sequence[torch.Tensor], mask: torch.Tensor, weights: Sequence[float] = ()
-) -> torch.Tensor:
-    """sum_l w_l mean |Phi_l(R * M_R) - Phi_l(T * M_T)|² (paper 4.2); w_l is 1 for every level without `weights`.
+def style_aligned(maps: Sequence[torch.Tensor], targets: Sequence[torch.Tensor], mask: torch.Tensor) -> torch.Tensor:
+    """sum_l mean |Phi_l(R * M_R) - Phi_l(T * M_T)|² (paper 4.2).
 
     `maps` are the features of the masked render, `targets` of the masked target. The loss is meaningful only if both
     show the same place: crops of the stylized view of the same camera. The pictures are masked before feature
@@ -96,8 +94,8 @@ def style_aligned(
     so that a half-empty crop weighs as much per pixel as a full one.
     """
     total = maps[0].new_zeros(())
-    for level, (a, b) in enumerate(zip(maps, targets, strict=True)):
-        total = total + _weight(weights, level) * functional.mse_loss(a, b)
+    for a, b in zip(maps, targets, strict=True):
+        total = total + functional.mse_loss(a, b)
     return total / mask.to(total.dtype).mean().clamp_min(1e-3)
 
 
@@ -106,7 +104,6 @@ def style_statistics(
     targets: Sequence[torch.Tensor],
     mask: torch.Tensor,
     target_mask: torch.Tensor,
-    weights: Sequence[float] = (),
     kind: Statistic = "gram",
     rng: np.random.Generator | None = None,
 ) -> torch.Tensor:
@@ -120,7 +117,7 @@ def style_statistics(
     """
     total = maps[0].new_zeros(())
     whole = mask, target_mask
-    for level, (a, b) in enumerate(zip(maps, targets, strict=True)):
+    for a, b in zip(maps, targets, strict=True):
         (a, mask), (b, target_mask) = (_subsampled(*each) for each in zip((a, b), whole, strict=True))
         if kind == "gram":
             mine, theirs = gram(a, mask), gram(b, target_mask)
@@ -132,7 +129,7 @@ def style_statistics(
             distance = ((mine - theirs).square().mean(dim=(1, 2)) / energy).mean()
         else:
             distance = _feature_swd(a, b, mask, target_mask, rng or np.random.default_rng(0))
-        total = total + _weight(weights, level) * distance
+        total = total + distance
     return total
 
 
@@ -304,10 +301,6 @@ def _draw(pixels: torch.Tensor, count: int, rng: np.random.Generator) -> torch.T
     if len(pixels) == count:
         return pixels
     return pixels[torch.from_numpy(rng.choice(len(pixels), count, replace=False))]
-
-
-def _weight(weights: Sequence[float], level: int) -> float:
-    return float(weights[level]) if level < len(weights) else (0.0 if weights else 1.0)
 
 
 def blur(x: Float[torch.Tensor, "n c h w"], radius: float) -> Float[torch.Tensor, "n c h w"]:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.camera import Camera, pixel_centres, px_from_world, world_from_px
+from mistyle.core.camera import Camera, in_frame, pixel_centres, px_from_world, world_from_px
 from mistyle.core.image import erode
 from mistyle.core.view import View
 
@@ -124,8 +124,7 @@ def _means(picture: np.ndarray, px: np.ndarray, axes: np.ndarray) -> Float[np.nd
 
 
 def _visible_in(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    height, width = view.camera.size
-    inside = (z > 0) & (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
+    inside = (z > 0) & in_frame(view.camera, px)
     column, row = np.where(inside[:, None], px, 0).astype(np.int64).T
     depth = np.where(np.isfinite(view.depth), view.depth, 1e9)[row, column]
     return inside & erode(view.mask, INSIDE)[row, column] & (np.abs(depth - z) < DEPTH_TOLERANCE)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -11,13 +10,11 @@ from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Texels
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.indirect import enlarged
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import Atlas
-
-if TYPE_CHECKING:
-    from mistyle.render.deferred.renderer import MaterialRenderer
 
 DISTRUST = 10.0  # a pixel's weight halves where indirect light is a tenth of the direct light
 
@@ -49,10 +46,8 @@ class FitContext:
 
     def renderer(
         self, subsamples: int | None = None, memory: float | None = None, gradients: bool = False
-    ) -> "MaterialRenderer":
+    ) -> MaterialRenderer:
         """A renderer of tables of this atlas; `memory` in bytes. Arguments left out come from the settings."""
-        from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
-
         s, soft = self.settings, has_soft(self.captures.lights)
         usual = s.soft_subsamples if soft else s.subsamples
         options = RenderOptions(

@@ -21,6 +21,7 @@ from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.emitters import emitters
 
 MOST = 512  # pixels along the longer side of the estimate at most; smaller pictures keep their size
@@ -43,9 +44,6 @@ class Indirect:
         self, mesh: Mesh, maps: Sequence[Maps], *, model: scenery.Model = "principled", frame: scenery.Frame = "mikkt"
     ) -> None:
         device.use()
-        import mitsuba
-
-        mi: Any = mitsuba
         matt = [replace(m, roughness=np.maximum(m.roughness, np.float32(ROUGH))) for m in maps]
         shapes = scenery.object_shapes(mesh, matt, model=model, frame=frame)
         self.scene = mi.load_dict({"type": "scene", **shapes}, optimize=False)
@@ -86,9 +84,6 @@ class Indirect:
     def _pictures(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
     ) -> list[tuple[Any, Any]]:
-        import mitsuba
-
-        mi: Any = mitsuba
         by = -(-max(camera.size) // MOST)
         # Partial pixels at the picture's border belong to the estimate.
         small = replace(binned(camera, by), size=(-(-camera.size[0] // by), -(-camera.size[1] // by)))
@@ -137,10 +132,6 @@ def _trace_paths(
     albedo of the first surface point, then indirect radiance under each of n = len(lit) sets of emitters. With
     `vectors`, 9 n more: world x, y, z of each set's vector irradiance. `sharp`: each shape's reflectance at the first
     point."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     sampler, pixel, ray = _camera_samples(sensor, each, seed)
     context = mi.BSDFContext()
     first = scene.ray_intersect(ray)
@@ -184,10 +175,6 @@ def _trace_paths(
 
 def _camera_samples(sensor: Any, each: int, seed: int) -> tuple[Any, Any, Any]:
     """The seeded sampler, and pixel and ray of each of `each` samples a pixel."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     width, height = (int(n) for n in sensor.film().size())
     count = width * height * each
     sampler = sensor.sampler()
@@ -205,10 +192,8 @@ def _vector_irradiance(first: Any, begin: Sequence[Any], totals: Sequence[Any]) 
 
     `begin` is the first ray, its throughput and its density; `totals` are radiance · reflectance · cosine / density.
     """
-    import drjit as dr
-
     ray, reflected, density = begin
-    cosine: Any = dr.abs(dr.dot(ray.d, first.sh_frame.n))
+    cosine = dr.abs(dr.dot(ray.d, first.sh_frame.n))
     share = dr.minimum(1, cosine / GRAZING) / dr.maximum(density, 1e-9)
     vectors = []
     for total in totals:
@@ -219,8 +204,6 @@ def _vector_irradiance(first: Any, begin: Sequence[Any], totals: Sequence[Any]) 
 
 def _pixels(values: Sequence[Any], pixel: Any, seen: Any, count: int, each: int) -> np.ndarray:
     """(count, n) float32: means over each pixel's `each` samples of n values; 0 where not `seen`."""
-    import drjit as dr
-
     sums = [dr.zeros(type(values[0]), count) for _ in values]
     for total, value in zip(sums, values, strict=True):
         dr.scatter_add(total, value / each, pixel, seen)
@@ -244,10 +227,6 @@ def _emitter_radiance(scene: Any, emitter: Any, segment: PathSegment, sampler: A
 
     Environment light uses both sampling strategies, weighted by the power heuristic (Veach and Guibas 1995).
     """
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     ray, si, last, density, escaped, hit = segment
     soft = emitter.is_environment()
     place = sampler.next_2d(hit) if soft else mi.Point2f(0.5)

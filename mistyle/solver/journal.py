@@ -42,9 +42,9 @@ class Journal:
         self.earlier: dict[str, Arrays] = {}
         self.resumed: Arrays | None = None
         if checkpoints.resume is not None:
-            self.resumed = _inside(checkpoints.resume, "state")
+            self.resumed = inside(checkpoints.resume, "state/")
             names = {name.split("/")[1] for name in checkpoints.resume if name.startswith("part/")}
-            self.earlier = {name: _inside(checkpoints.resume, f"part/{name}") for name in sorted(names)}
+            self.earlier = {name: inside(checkpoints.resume, f"part/{name}/") for name in sorted(names)}
 
     def begin(self, state: Arrays, done: int) -> None:
         """A pass begins in `state`, after `done` passes."""
@@ -104,5 +104,6 @@ def text_value(array: np.ndarray) -> Any:
     return json.loads(array.tobytes())
 
 
-def _inside(arrays: Arrays, prefix: str) -> Arrays:
-    return {name[len(prefix) + 1 :]: value for name, value in arrays.items() if name.startswith(f"{prefix}/")}
+def inside(arrays: Arrays, prefix: str) -> Arrays:
+    """The arrays whose names begin with `prefix`, by the rest of their names."""
+    return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}

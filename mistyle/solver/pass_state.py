@@ -6,7 +6,7 @@ import numpy as np
 
 from mistyle.render.deferred.material_table import MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.journal import Arrays, text_array, text_value
+from mistyle.solver.journal import Arrays, inside, text_array, text_value
 from mistyle.solver.texels.records import Solution
 from mistyle.solver.texels.solve import TexelEstimate
 
@@ -53,7 +53,7 @@ def state_from(arrays: Arrays, context: FitContext) -> PassState:
     for name, light in arrays.items():
         if name.startswith("indirect."):
             direct = direct.with_indirect(int(name.split(".")[1]), light)
-    records = {name: _inside(arrays, f"{name}.") for name in ("solution", "estimate")}
+    records = {name: inside(arrays, f"{name}.") for name in ("solution", "estimate")}
     solution = Solution(**records["solution"]) if records["solution"] else None
     estimate = None
     if records["estimate"]:
@@ -61,7 +61,3 @@ def state_from(arrays: Arrays, context: FitContext) -> PassState:
         estimate = TexelEstimate(**records["estimate"], solved=solved)
     own = {name: words[name] for name in ("done", "settled", "over")}
     return PassState(direct, solution=solution, estimate=estimate, table=arrays.get("table"), **own)
-
-
-def _inside(arrays: Arrays, prefix: str) -> dict[str, np.ndarray]:
-    return {name[len(prefix) :]: value for name, value in arrays.items() if name.startswith(prefix)}

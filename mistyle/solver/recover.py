@@ -13,7 +13,6 @@ cameras are fixed. A common factor of light and albedo is not identifiable: albe
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -24,14 +23,27 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, surface_of
 from mistyle.core.stage_progress import StageProgress
 from mistyle.process import memory, stopping
-from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT, MaterialTable
+from mistyle.render.deferred.image_samples import tangents_of
+from mistyle.render.deferred.material_table import (
+    ALBEDO,
+    METALLIC,
+    ROUGHNESS,
+    SOLVED,
+    TILT,
+    MaterialTable,
+    pack,
+    unpack,
+)
+from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.render.mitsuba.device import give_back
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.deviation import class_std
 from mistyle.solver.joint.gauss_newton import TOO_LARGE, JointSetup, joint_pass, joint_setup
 from mistyle.solver.journal import Checkpoints, Journal, TimeOver
 from mistyle.solver.pass_state import PassState, arrays_of, state_from
 from mistyle.solver.pictures.descend import picture_pass, settled
+from mistyle.solver.pictures.polish import PolishSettings, polish
 from mistyle.solver.schedule import Pass, Size, runnable, schedule, shares, size_from
 from mistyle.solver.settings import RecoverSettings, descent_steps, joint_steps
 from mistyle.solver.smoothing import map_smoothing
@@ -48,9 +60,6 @@ from mistyle.solver.texels.solve import (
 )
 from mistyle.solver.validate import validate_captures
 from mistyle.solver.visible import visible_shares
-
-if TYPE_CHECKING:
-    from mistyle.render.deferred.renderer import MaterialRenderer
 
 __all__ = ["Checkpoints", "Limits", "Reached", "RecoverSettings", "Recovered", "recover"]
 
@@ -155,9 +164,6 @@ def recover(
     which a later call ends with the same bytes. Unusable pictures are skipped with a note. Raises InputRefused if all
     are, and Stopped, after a checkpoint, on a stop request.
     """
-    from mistyle.render.deferred.image_samples import tangents_of
-    from mistyle.render.mitsuba.draw import tracer
-
     notes: list[str] = []
     soft, wanted = has_soft(captures.lights), joint_steps(settings)
     settings = runnable(settings, soft, sum(t.covered.size for t in texels))
@@ -292,7 +298,7 @@ class _Work:
             self._level = texel_level(self.context, lambda: self.renderer(None), self.start, progress)
         return self._level
 
-    def renderer(self, state: PassState | None) -> "MaterialRenderer":
+    def renderer(self, state: PassState | None) -> MaterialRenderer:
         """The renderer of the whole atlas, with the references of a state."""
         if self._renderer is None:
             self._renderer, self._targets = (
@@ -369,9 +375,6 @@ def polished(context: FitContext, table: MaterialTable, progress: Callable[[floa
 
     A result whose loss does not fall is dropped, with a note.
     """
-    from mistyle.render.deferred.material_table import pack, unpack
-    from mistyle.solver.pictures.polish import PolishSettings, polish
-
     s = context.settings
     chosen = PolishSettings(s.polish, s.loss, s.polish_rate, s.metallic, s.polish_depth, model=s.model, frame=s.frame)
     start = unpack(table, context.atlas.sizes)
@@ -436,7 +439,5 @@ def _recovered(
 
 def _maps(context: FitContext, estimate: TexelEstimate, table: MaterialTable) -> tuple[Maps, ...]:
     """A table as maps, `known` where a picture observed the texel in the light."""
-    from mistyle.render.deferred.material_table import unpack
-
     sets = zip(unpack(table, context.atlas.sizes), context.atlas.parts, strict=True)
     return tuple(replace(m, known=estimate.seen[part].reshape(m.known.shape) > 0) for m, part in sets)

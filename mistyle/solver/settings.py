@@ -3,7 +3,9 @@
 from math import isqrt
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
+
+from mistyle.core.settings import FrozenModel
 
 SETTLING = 3
 FEWER = 8  # factor of fewer samples for provisional estimates of indirect light
@@ -14,13 +16,11 @@ LARGE = 4_000_000  # pixels of a picture from which it is averaged for a coarser
 SWEEPS = 2  # least epochs of a pass; fewer steps give fewer passes
 
 
-class RecoverSettings(BaseModel):
+class RecoverSettings(FrozenModel):
     """Settings of `solver/recover.py`; defaults come from measurements on synthetic maps with ground truth.
 
     Radiance settings are relative to the brightest observed radiance, so no default depends on the exposure.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     model: Literal["principled", "gltf"] = Field(
         default="principled", description="reflectance: Mitsuba's principled, or glTF's metallic-roughness exactly"

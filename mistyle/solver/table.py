@@ -75,13 +75,11 @@ def scatter(values: np.ndarray, observed: TexelObservations, atlas: Atlas, other
     return result
 
 
-def fill(table: Float[np.ndarray, "a c"], atlas: Atlas, only: np.ndarray | None = None) -> Float[np.ndarray, "a c"]:
-    """Uncovered texels (only those in `only`, if any) take the values of the nearest covered one of their set."""
+def fill(table: Float[np.ndarray, "a c"], atlas: Atlas) -> Float[np.ndarray, "a c"]:
+    """Uncovered texels take the values of the nearest covered one of their set."""
     result = table.copy()
     for part, covered, closest in zip(atlas.parts, atlas.covered, atlas.closest, strict=True):
         empty = ~covered.ravel()
-        if only is not None:
-            empty &= only[part]
         result[part][empty] = table[part][closest[empty]]
     return result
 

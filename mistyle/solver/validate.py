@@ -10,6 +10,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
+from mistyle.solver.texels.observations import texel_sizes
 
 LEAST_VIEWS = 3
 FINE = 0.25  # largest share of texels narrower than ACROSS blocks of averaged pixels
@@ -68,8 +69,6 @@ def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) ->
     At least three in four of the texels that face the camera, hidden ones included, are that wide. With texels one
     block wide the normals' error nearly doubles; with four it falls by a quarter (`python -m benchmarks.photographs`).
     """
-    from mistyle.solver.texels.observations import texel_sizes
-
     covered = [t.covered for t in texels]
     position, normal = (
         np.concatenate([field[c] for field, c in zip(fields, covered, strict=True)])

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.camera import Camera, by_camera, px_from_world
+from mistyle.core.camera import Camera, by_camera, in_frame, px_from_world
 from mistyle.core.light import DELTA, Directional, Lights, direction_in_world, has_soft, position_in_world
 from mistyle.core.mesh import SpreadPoints
 from mistyle.core.rows import evenly
@@ -37,7 +37,7 @@ def _shares(
 ) -> Visible:
     """The shares of one picture."""
     (height, width), (px, depth) = camera.size, px_from_world(camera, points)
-    inside = (depth > 0) & (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
+    inside = (depth > 0) & in_frame(camera, px)
     if not inside.any():
         return Visible(0.0, 0.0, 0.0)
     low, cells = px[inside].min(axis=0), min(CELLS, max(1, int((inside.sum() / EACH) ** 0.5)))

@@ -5,11 +5,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from mistyle.atlas.bake_settings import BakeSettings
-from mistyle.atlas.settings import AtlasSettings
-from mistyle.core.rig_settings import RigSettings
+from mistyle.atlas.settings import AtlasSettings, BakeSettings
+from mistyle.core.settings import FrozenModel, RigSettings
 from mistyle.jobs import settings
 from mistyle.jobs.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.jobs.job_settings import ReadSettings, ReportSettings
@@ -24,10 +23,8 @@ from mistyle.stylization.surface.settings import PaintSettings, SurfaceSettings
 READ_SAMPLES = 8  # per pixel of a view that a stylizer reads
 
 
-class DrawSettings(BaseModel):
+class DrawSettings(FrozenModel):
     """How the views of the mesh are rendered (paper 4.1.1)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     spp: int = Field(
         default=0,
@@ -45,10 +42,8 @@ class DrawSettings(BaseModel):
         return self.spp or (READ_SAMPLES if read else 1)
 
 
-class Settings(BaseModel):
+class Settings(FrozenModel):
     """Settings of one job."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
     threads: int = Field(

@@ -9,13 +9,13 @@ from helpers import data
 
 from mistyle.atlas import bake as stage
 from mistyle.atlas.bake import Backprojection, backproject, bake, fill, pure_colours
-from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.settings import BakeSettings
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, look_at, orbit, pixel_centres, px_from_world, rig
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 
 SETTINGS = BakeSettings()

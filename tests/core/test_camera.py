@@ -21,7 +21,7 @@ from mistyle.core.camera import (
     world_from_px,
     zoom,
 )
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 
 # float64 projections of points a few units away: rounding only.
 EXACT = 1e-9

@@ -10,6 +10,7 @@ from mistyle.core.camera import orbit, pixel_centres
 from mistyle.core.image import gaussian
 from mistyle.core.view import View
 from mistyle.measure import colour_difference, metrics
+from mistyle.measure.overlap import overlap
 
 
 def noise(rng, size=96, sigma=1.5, mean=0.5):
@@ -51,12 +52,13 @@ def test_lab_of_known_colours():
 
 def test_patch_distance_knows_a_style_from_another(rng):
     fine, coarse = noise(rng, sigma=1), noise(rng, sigma=5)
-    assert metrics.patch_distance([fine], [WHOLE], [fine]) == pytest.approx(0, abs=1e-5)
-    halves = metrics.patch_distance([fine[:, :48]], [WHOLE[:, :48]], [fine[:, 48:]])
-    assert halves < 0.6 * metrics.patch_distance([fine], [WHOLE], [coarse])
+    assert metrics.PatchReference([WHOLE], [fine], [WHOLE]).distance([fine]) == pytest.approx(0, abs=1e-5)
+    half = WHOLE[:, :48]
+    halves = metrics.PatchReference([half], [fine[:, 48:]], [half]).distance([fine[:, :48]])
+    assert halves < 0.6 * metrics.PatchReference([WHOLE], [coarse], [WHOLE]).distance([fine])
     # A shift of lightness by 10 of 100 moves each projection by 0.1 times the sum of the axis' 25 L weights.
     left, right = (np.full((40, 40, 3), value, np.float32) for value in (0.46633, 0.5669))  # L = 50 and 60
-    shift = metrics.patch_distance([left], [WHOLE[:40, :40]], [right])
+    shift = metrics.PatchReference([WHOLE[:40, :40]], [right], [WHOLE[:40, :40]]).distance([left])
     rng = np.random.default_rng(0)
     axes = rng.normal(size=(75, 64))
     axes /= np.linalg.norm(axes, axis=0)
@@ -65,20 +67,20 @@ def test_patch_distance_knows_a_style_from_another(rng):
 
 def test_gram_distance_forgets_places(rng):
     fine, coarse = noise(rng, sigma=1), noise(rng, sigma=5)
-    assert metrics.gram_distance([fine], [WHOLE], [fine]) == 0
-    mirrored = metrics.gram_distance([fine], [WHOLE], [fine[::-1, ::-1]])
-    assert mirrored < 0.2 * metrics.gram_distance([fine], [WHOLE], [coarse])
-    assert metrics.style_distance([fine], [WHOLE], [fine]) == pytest.approx(0, abs=1e-5)
+    one, turned, other = (metrics.pooled_gram([p], [WHOLE]) for p in (fine, fine[::-1, ::-1], coarse))
+    assert metrics.gram_distance(one, one) == 0
+    assert metrics.gram_distance(one, turned) < 0.2 * metrics.gram_distance(one, other)
+    assert metrics.StyleReference([WHOLE], [fine], [WHOLE]).distance([fine]) == pytest.approx(0, abs=1e-5)
 
 
 def test_detail_correlation(rng):
     a = noise(rng, sigma=2)
-    assert metrics.detail_correlation(a, a, WHOLE) == pytest.approx(1, abs=1e-6)
-    assert metrics.detail_correlation(a, np.clip(0.3 + 0.4 * a, 0, 1), WHOLE) > 0.97
-    assert metrics.detail_correlation(a, 1 - a, WHOLE) < -0.95
-    assert abs(metrics.detail_correlation(a, noise(rng, sigma=2), WHOLE)) < 0.25
+    assert consistency.detail_correlation(a, a, WHOLE) == pytest.approx(1, abs=1e-6)
+    assert consistency.detail_correlation(a, np.clip(0.3 + 0.4 * a, 0, 1), WHOLE) > 0.97
+    assert consistency.detail_correlation(a, 1 - a, WHOLE) < -0.95
+    assert abs(consistency.detail_correlation(a, noise(rng, sigma=2), WHOLE)) < 0.25
     light = np.linspace(0.6, 1, 96, dtype=np.float32)[None, :, None]
-    assert metrics.detail_correlation(a * light, a, WHOLE) > 0.95
+    assert consistency.detail_correlation(a * light, a, WHOLE) > 0.95
 
 
 def test_edge_recall_gives_noise_no_credit(rng):
@@ -122,17 +124,17 @@ def test_warp_error_is_small_for_one_painting_and_by_hand_for_two_colours():
         return np.repeat(waves, 3, axis=-1).astype(np.float32)
 
     # Bilinear lookups in a wave of about 50 pixels.
-    assert metrics.warp_error(a, b, painted(a), painted(b)) < 0.3
-    assert metrics.warp_error(a, b, painted(a), painted(b)[:, ::-1]) > 5
+    assert metrics.warp_error(overlap(a, b), painted(a), painted(b)) < 0.3
+    assert metrics.warp_error(overlap(a, b), painted(a), painted(b)[:, ::-1]) > 5
     grey, lighter = (np.full((96, 96, 3), v, np.float32) for v in (0.46633, 0.5669))  # L = 50 and 60, a = b = 0
-    assert metrics.warp_error(a, b, grey, lighter) == pytest.approx(10, abs=0.05)
+    assert metrics.warp_error(overlap(a, b), grey, lighter) == pytest.approx(10, abs=0.05)
 
 
 def test_warp_error_leaves_out_what_the_other_view_cannot_see():
     a, b = plane_view(0), plane_view(30)
     hidden = replace(b, depth=(b.depth - 0.5).astype(np.float32))
     picture = np.zeros((96, 96, 3), np.float32)
-    assert np.isnan(metrics.warp_error(a, hidden, picture, picture))
+    assert np.isnan(metrics.warp_error(overlap(a, hidden), picture, picture))
 
 
 def test_seam_ratio_sees_a_step_at_a_seam_only(rng):
@@ -149,14 +151,8 @@ def test_seam_ratio_sees_a_step_at_a_seam_only(rng):
     assert consistency.seam_ratio(seamed, stepped) == pytest.approx(0.2 / 0.0226, rel=0.15)
 
 
-def test_coverage_by_hand():
-    covered = np.array([[True, True], [True, False]])
-    assert metrics.coverage(np.array([[True, False], [False, True]]), covered) == pytest.approx(1 / 3)
-    assert np.isnan(metrics.coverage(covered, np.zeros((2, 2), bool)))
-
-
 def test_a_view_without_the_mesh_is_no_number():
     empty = replace(plane_view(0), mask=np.zeros((96, 96), bool))
     picture = np.zeros((96, 96, 3), np.float32)
-    assert np.isnan(metrics.warp_error(empty, plane_view(30), picture, picture))
+    assert np.isnan(metrics.warp_error(overlap(empty, plane_view(30)), picture, picture))
     assert np.isnan(consistency.seam_ratio(empty, picture))

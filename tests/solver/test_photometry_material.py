@@ -66,7 +66,7 @@ def test_the_reduced_system_is_that_of_the_model(glossy):
     """Its gradient against differences of the cost, the texels answering each time."""
     samples = material.material_samples(*glossy, None)
     samples = replace(samples, regions=None)
-    problem = material.problem_of(samples, Options())
+    problem = material.Problem(samples.points, samples.rig, samples.observations, Options())
     work = material._Solve(samples, problem)
     rng = np.random.default_rng(0)
     start = Gains(rng.normal(0, 0.05, (VIEWS, 3)), np.array([0.05, 0.0, 0.0]))

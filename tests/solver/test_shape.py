@@ -9,7 +9,7 @@ import trimesh
 
 from mistyle.core.camera import Camera, orbit, px_from_world, rig
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.geometry.intersections import self_intersections
 from mistyle.render.mitsuba.draw import misses, tracer
 from mistyle.render.mitsuba.unlit import unlit

@@ -176,7 +176,8 @@ def test_the_height_map_has_the_reliefs_slope_and_the_meshs_units(inputs, tmp_pa
 def test_the_heights_gradient_is_the_reliefs(tmp_path):
     from mistyle.deliver.colour import read_style
     from mistyle.stylization.settings import Settings
-    from mistyle.stylization.surface.surface_painter import solve_surface, surface_height, surface_relief
+    from mistyle.stylization.surface.lookup import height, relief
+    from mistyle.stylization.surface.painter import solve_surface
 
     trimesh.creation.icosphere(subdivisions=4).export(tmp_path / "ball.obj")
     y, x = np.mgrid[:384, :512] / 64
@@ -191,9 +192,9 @@ def test_the_heights_gradient_is_the_reliefs(tmp_path):
     along = np.cross(points, rng.standard_normal((4000, 3))).astype(np.float32)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     step = np.float32(painted.spacing / max(painted.scale))  # a pixel of the painting
-    ends = [surface_height(painted, points + s * step * along, points) for s in (1, -1)]
+    ends = [height(painted, points + s * step * along, points) for s in (1, -1)]
     measured = (ends[0] - ends[1]) / (2 * step)
-    expected = (surface_relief(painted, points, points)[0] * along).sum(axis=1)
+    expected = (relief(painted, points, points)[0] * along).sum(axis=1)
     # Steps between pieces are no slope of the relief: most points lie inside one.
     inside = np.abs(measured - expected) < 0.1 * np.abs(expected).max()
     assert inside.mean() > 0.8

@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mistyle import __version__
 from mistyle.core.asset import Asset
 from mistyle.core.errors import MistyleError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
+from mistyle.core.settings import FrozenModel
 from mistyle.deliver.lookdev.canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
 from mistyle.deliver.lookdev.shape import ASIDE, reshaped
 from mistyle.io.store.atomic import atomic_write, sha256_file
@@ -33,10 +34,8 @@ TURNS = {"turntable": "turn the asset", "light_turn": "turn the light"}
 LIGHT_STEPS = 8  # pictures of the HDRI's rotation on the sheet
 
 
-class LookSettings(BaseModel):
+class LookSettings(FrozenModel):
     """Settings of the sheet and the turntables."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     size: int = Field(default=USUAL, ge=64, le=4096, description="pixels of the sheet's largest pictures of the asset")
     spp: int = Field(default=64, ge=1, le=65536, description="samples per pixel of the largest pictures")

@@ -2,18 +2,17 @@
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from mistyle.atlas.settings import AtlasSettings
+from mistyle.core.settings import FrozenModel
 from mistyle.jobs.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.jobs.job_settings import LEAST_OVERLAP, ReadSettings, ReportSettings
 from mistyle.solver.settings import RecoverSettings
 
 
-class ReferenceSettings(BaseModel):
+class ReferenceSettings(FrozenModel):
     """Reading and alignment of the reference pictures."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     saturation: float = Field(
         default=1.0, gt=0, le=1, description="least encoded value of a saturated channel (below 1 for JPEGs)"
@@ -52,10 +51,8 @@ class ReferenceSettings(BaseModel):
     )
 
 
-class PhotometrySettings(BaseModel):
+class PhotometrySettings(FrozenModel):
     """Solving for the pictures' exposure, white balance and vignetting."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mode: Literal["auto", "none", "exposure", "full"] = Field(
         default="auto",
@@ -65,10 +62,8 @@ class PhotometrySettings(BaseModel):
     exif: bool = Field(default=True, description="use EXIF's exposure time, f-number and ISO speed as a prior")
 
 
-class LightSettings(BaseModel):
+class LightSettings(FrozenModel):
     """Solving for an unknown light."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sun: bool = Field(default=False, description="look for a sun beside the environment (--light outdoors)")
     albedo: tuple[float, float, float] | None = Field(
@@ -76,10 +71,8 @@ class LightSettings(BaseModel):
     )
 
 
-class MaterialSettings(BaseModel):
+class MaterialSettings(FrozenModel):
     """The settings of one fit of a material to pictures."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
     memory: float = Field(

@@ -2,13 +2,13 @@
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from mistyle.core.settings import FrozenModel
 
 
-class SceneSettings(BaseModel):
+class SceneSettings(FrozenModel):
     """The settings of one fit of a Mitsuba scene's parameters."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
     threads: int = Field(default=0, ge=0, le=1024, description="threads of the renderer; 0 takes all cores")

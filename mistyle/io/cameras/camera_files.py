@@ -299,14 +299,11 @@ def _camera(entry: ViewEntry, path: Path) -> Camera:
         raise refuse(path, f"no pose in {where}", "opencv {R, t} or opengl {R, t}", "Add one of them")
     if entry.name != PurePosixPath(entry.name).name or "\\" in entry.name or "\0" in entry.name:
         raise refuse(path, f"the name {entry.name!r}", "a file name without folders", "Rename the view")
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3], cam_from_world[:3, 3] = pose.R, pose.t
-    cam_from_world = flip @ cam_from_world
+    cam_from_world = flip @ similarity(1.0, np.array(pose.R), np.array(pose.t))
     _check_square(entry.fx, entry.fy, where, path)
-    check_rotation(cam_from_world[:3, :3], where, path)
-    world_from_cam = np.eye(4)
-    world_from_cam[:3, :3] = cam_from_world[:3, :3].T
-    world_from_cam[:3, 3] = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
+    back = cam_from_world[:3, :3].T
+    check_rotation(back.T, where, path)
+    world_from_cam = similarity(1.0, back, -back @ cam_from_world[:3, 3])
     azimuth, elevation = (float("nan") if a is None else float(a) for a in (entry.azimuth, entry.elevation))
     size = (entry.height, entry.width)
     return Camera(world_from_cam, entry.fx, (entry.cx, entry.cy), size, entry.name, azimuth, elevation)

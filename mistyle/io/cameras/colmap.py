@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.errors import InputRefused
 from mistyle.geometry.lens import Lens
+from mistyle.geometry.similarity import similarity
 from mistyle.io.cameras.camera_files import MAX_SIDE, CameraFrame, check_rotation, unique_names
 from mistyle.io.sandbox.bounds import read_bytes, refuse
 
@@ -118,8 +118,6 @@ def _guarded(reader, path: Path):
     """The result of `reader`; truncated and invalid files are refused."""
     try:
         return reader(path)
-    except InputRefused:
-        raise
     except (struct.error, ValueError, IndexError, OverflowError, UnicodeDecodeError) as error:
         problem = f"a damaged or cut-off file ({str(error)[:100]})"
         raise refuse(path, problem, f"COLMAP's {path.name}", AGAIN) from error
@@ -157,10 +155,7 @@ def _world_from_cam(pose: tuple[float, ...], picture: str, path: Path) -> Float[
         ]
     )
     check_rotation(rotation, picture, path)
-    result = np.eye(4)
-    result[:3, :3] = rotation.T
-    result[:3, 3] = -rotation.T @ shift
-    return result
+    return similarity(1.0, rotation.T, -rotation.T @ shift)
 
 
 class _Bytes:

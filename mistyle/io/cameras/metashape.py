@@ -17,8 +17,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.errors import InputRefused
 from mistyle.geometry.lens import Lens
+from mistyle.geometry.similarity import similarity
 from mistyle.io.cameras.camera_files import MAX_SIDE, CameraFrame, check_rotation, unique_names
 from mistyle.io.sandbox.bounds import read_bytes, refuse
 
@@ -47,8 +47,6 @@ def read_cameras(path: Path) -> list[CameraFrame]:
             found = f"{len(chunks)} chunks with aligned cameras"
             raise refuse(path, found, "one", "Align the photographs, and export the cameras of one chunk")
         return _frames(chunks[0], path)
-    except InputRefused:
-        raise
     except (ElementTree.ParseError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise refuse(path, f"a damaged file ({str(error)[:100]})", "Metashape's cameras", AGAIN) from error
 
@@ -74,10 +72,9 @@ def _frames(chunk: Element, path: Path) -> list[CameraFrame]:
         if camera.get("sensor_id") not in lenses:
             raise refuse(path, f"no sensor of {where}", "an entry of 'sensors'", AGAIN)
         pose = _numbers(camera.findtext("transform"), 16, where, path).reshape(4, 4)
-        world_from_cam = np.eye(4)
-        world_from_cam[:3, :3] = world[:3, :3] / np.cbrt(np.linalg.det(world[:3, :3])) @ pose[:3, :3]
-        world_from_cam[:3, 3] = world[:3, :3] @ pose[:3, 3] + world[:3, 3]
-        check_rotation(world_from_cam[:3, :3], where, path)
+        rotation = world[:3, :3] / np.cbrt(np.linalg.det(world[:3, :3])) @ pose[:3, :3]
+        check_rotation(rotation, where, path)
+        world_from_cam = similarity(1.0, rotation, world[:3, :3] @ pose[:3, 3] + world[:3, 3])
         lens = _lens(lenses[camera.get("sensor_id")], where, path)
         frames.append(CameraFrame(name, label, None, world_from_cam, lens, "stored"))
     return frames

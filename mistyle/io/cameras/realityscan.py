@@ -31,8 +31,8 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.errors import InputRefused
 from mistyle.geometry.lens import Lens
+from mistyle.geometry.similarity import similarity
 from mistyle.io.cameras.camera_files import CameraFrame, check_rotation, unique_names
 from mistyle.io.cameras.realityscan_files import LENS, MAX_BYTES, OPTIONAL, POSE, XCR, columns_in, header_of, sidecars
 from mistyle.io.sandbox.bounds import read_bytes, refuse
@@ -54,8 +54,6 @@ def read_cameras(path: Path) -> list[CameraFrame]:
     """
     try:
         return _sidecar_frames(path) if path.is_dir() else _table_frames(path)
-    except InputRefused:
-        raise
     except (ElementTree.ParseError, csv.Error, UnicodeDecodeError, ValueError) as error:
         raise refuse(path, f"a damaged file ({str(error)[:100]})", "RealityScan's cameras", AGAIN) from error
 
@@ -101,8 +99,8 @@ def _table_frames(path: Path) -> list[CameraFrame]:
             found = f"k1 alone in the lens of {where}, as the division model has it"
             raise refuse(path, found, "the coefficients of Brown's model", UNDISTORT)
         rotation = cam_from_world(value["heading"], value["pitch"], value["roll"])
-        position = np.array([value["x"], value["y"], value["alt"]])
-        frames.append(_frame(name, picture, rotation, position, _lens(value, where, path)))
+        pose = similarity(1.0, rotation.T, np.array([value["x"], value["y"], value["alt"]]))
+        frames.append(CameraFrame(name, picture, None, pose, _lens(value, where, path), "stored"))
     return frames
 
 
@@ -158,8 +156,8 @@ def _sidecar_frames(folder: Path) -> list[CameraFrame]:
         value |= _coefficients(file, text, where)
         rotation = _numbers(file, text["Rotation"], "Rotation", 9).reshape(3, 3)
         check_rotation(rotation, where, file)
-        position = _numbers(file, text["Position"], "Position", 3)
-        frames.append(_frame(file.stem, file.stem, rotation, position, _lens(value, where, file)))
+        pose = similarity(1.0, rotation.T, _numbers(file, text["Position"], "Position", 3))
+        frames.append(CameraFrame(file.stem, file.stem, None, pose, _lens(value, where, file), "stored"))
     return frames
 
 
@@ -201,9 +199,3 @@ def _lens(value: Mapping[str, float], where: str, path: Path) -> Lens:
     k1, k2, k3, k4, t1, t2 = (value[key] for key in LENS)
     focal = value["f"] / FILM
     return Lens((focal, focal), (value["px"], value["py"]), (1, 1), (k1, k2, k3), (t2, t1), k4)
-
-
-def _frame(name: str, picture: str, rotation: np.ndarray, position: np.ndarray, lens: Lens) -> CameraFrame:
-    world_from_cam = np.eye(4)
-    world_from_cam[:3, :3], world_from_cam[:3, 3] = rotation.T, position
-    return CameraFrame(name, picture, None, world_from_cam, lens, "stored")

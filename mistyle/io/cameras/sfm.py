@@ -14,6 +14,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from mistyle.core.errors import InputRefused
 from mistyle.geometry.lens import Lens
+from mistyle.geometry.similarity import similarity
 from mistyle.io.cameras.camera_files import MAX_SIDE, CameraFrame, check_rotation, unique_names
 from mistyle.io.read import read_json
 from mistyle.io.sandbox.bounds import refuse
@@ -96,9 +97,7 @@ def read_sfm(path: Path) -> list[CameraFrame]:
             raise refuse(path, f"no intrinsics of {where}", "an entry of 'intrinsics'", "Export it again")
         lens = _lens(lenses[str(view.intrinsicId)], tuple(data.version) >= (1, 2, 1), where, path)
         pose = poses[str(view.poseId)]
-        world_from_cam = np.eye(4)
-        world_from_cam[:3, :3] = np.reshape(pose.rotation, (3, 3))
-        world_from_cam[:3, 3] = pose.center
+        world_from_cam = similarity(1.0, np.reshape(pose.rotation, (3, 3)), np.array(pose.center))
         check_rotation(world_from_cam[:3, :3], where, path)
         frames.append(CameraFrame(name, view.path, None, world_from_cam, lens, "stored"))
     return frames

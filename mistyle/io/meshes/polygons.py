@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.rows import sums
 from mistyle.io.sandbox.bounds import refuse
 
 MAX_EARS = 500
@@ -68,7 +69,7 @@ def _concave(sizes: Int[np.ndarray, " p"], corners: Float[np.ndarray, "c 3"]) ->
     corner, after, before = corners, corners[first + (step + 1) % size], corners[first + (step - 1) % size]
     polygon = np.repeat(np.arange(len(sizes)), sizes)
     around = np.cross(corner - corners[first], after - corners[first])
-    normal = np.stack([np.bincount(polygon, around[:, k], len(sizes)) for k in range(3)], axis=1)
+    normal = sums(polygon, around, len(sizes))
     turn = (np.cross(corner - before, after - corner) * normal[polygon]).sum(axis=1)
     scale = (normal**2).sum(axis=1)[polygon]
     return np.unique(polygon[(turn < -1e-9 * scale) & (size > 3)])

@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from mistyle.render.mitsuba.device import dr
+
 # Mitsuba's floor of the GGX alpha; roughness² below it has no effect and no gradient, in both models.
 ALPHA_FLOOR = 1e-3
 ROUGHNESS_FLOOR = ALPHA_FLOOR**0.5
@@ -48,28 +50,6 @@ class Angles(NamedTuple):
     valid: Any
 
 
-def principled(wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5) -> Any:
-    """f cos(theta_o) of Mitsuba 3.9.1's `principled` with base_color, roughness, metallic, specular; one sided.
-
-    Burley diffuse and retro-reflection, not scaled by 1 - F; GGX with alpha = max(0.001, roughness²), separable Smith,
-    exact dielectric Fresnel of eta = 2 / (1 - sqrt(0.08 specular)) - 1, Schlick for the metal. With `specular` 0 plugin
-    and function have no specular reflection, not even for metals. Unlike the plugin's, the gradient by metallic at
-    exactly 1 includes the diffuse part.
-    """
-    return _reflected(_principled, wi, wo, albedo, roughness, metallic, specular)
-
-
-def gltf(wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5) -> Any:
-    """f cos(theta_o) of glTF 2.0's metallic-roughness material, appendix B.2: mix(dielectric, metal, metallic).
-
-    dielectric = mix(albedo / pi, D V, F(0.04)), metal = D V F(albedo); F(f0) = f0 + (1 - f0)(1 - |wi·h|)^5, D is GGX
-    with alpha = max(0.001, roughness²) (the specification leaves roughness 0 to the renderer), V height-correlated
-    Smith. `specular` / 0.5 scales the reflection of the dielectric; 0.5 is the specification. One sided. The
-    specification's second form, one Fresnel term for the mixed f0, differs where 0 < metallic < 1.
-    """
-    return _reflected(_gltf, wi, wo, albedo, roughness, metallic, specular)
-
-
 def evaluate(
     reflectance: Reflectance, wi: Any, wo: Any, normal: Any, albedo: Any, roughness: Any, metallic: Any
 ) -> Any:
@@ -79,8 +59,6 @@ def evaluate(
     use_shadowing_function: light or camera below the perturbed horizon give 0. `wi`, `wo` in the unperturbed frame, on
     either side of the surface.
     """
-    import drjit as dr
-
     linear, constant = terms(reflectance, wi, wo, normal, roughness, metallic)
     return dr.fma(albedo, linear, constant)
 
@@ -90,8 +68,6 @@ def terms(reflectance: Reflectance, wi: Any, wo: Any, normal: Any, roughness: An
 
     Several lights can be summed before multiplication by the albedo.
     """
-    import drjit as dr
-
     wo_z, wi_z = dr.mulsign(wo.z, wi.z), dr.abs(wi.z)
     x, y, z = normal.x, normal.y, normal.z
     if reflectance.flip_invalid:
@@ -112,17 +88,16 @@ def upright(wi: Any, wo: Any) -> Angles:
     return _angles((0, 0, 1), (wi.x, wi.y, wi.z), (wo.x, wo.y, wo.z), True)
 
 
-def _reflected(lobes: Callable, wi, wo, albedo, roughness, metallic, specular: float) -> Any:
-    import drjit as dr
-
+def from_front(
+    model: str, wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5
+) -> Any:
+    """f cos(theta_o) of one of MODELS, one sided, without a normal map."""
     angles = upright(wi, wo)
-    linear, constant = lobes(angles, roughness, metallic, specular)
+    linear, constant = MODELS[model](angles, roughness, metallic, specular)
     return dr.fma(albedo, dr.select(angles.valid, linear, 0), dr.select(angles.valid, constant, 0))
 
 
 def _angles(n: tuple, wi: tuple, wo: tuple, valid: Any) -> Angles:
-    import drjit as dr
-
     cos_i, cos_o = _dot(n, wi), _dot(n, wo)
     half = (wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2])
     length2 = _dot(half, half)
@@ -141,8 +116,13 @@ def _angles(n: tuple, wi: tuple, wo: tuple, valid: Any) -> Angles:
 
 
 def _principled(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[Any, Any]:
-    import drjit as dr
+    """Mitsuba 3.9.1's `principled` with base_color, roughness, metallic, specular.
 
+    Burley diffuse and retro-reflection, not scaled by 1 - F; GGX with alpha = max(0.001, roughness²), separable Smith,
+    exact dielectric Fresnel of eta = 2 / (1 - sqrt(0.08 specular)) - 1, Schlick for the metal. With `specular` 0 plugin
+    and function have no specular reflection, not even for metals. Unlike the plugin's, the gradient by metallic at
+    exactly 1 includes the diffuse part.
+    """
     dielectric = 1 - metallic
     fi, fo = _schlick(a.cos_i), _schlick(a.cos_o)
     retro = 2 * dr.square(a.cos_d) * roughness
@@ -160,8 +140,13 @@ def _principled(a: Angles, roughness: Any, metallic: Any, specular: float) -> tu
 
 
 def _gltf(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[Any, Any]:
-    import drjit as dr
+    """glTF 2.0's metallic-roughness material, appendix B.2: mix(dielectric, metal, metallic).
 
+    dielectric = mix(albedo / pi, D V, F(0.04)), metal = D V F(albedo); F(f0) = f0 + (1 - f0)(1 - |wi·h|)^5, D is GGX
+    with alpha = max(0.001, roughness²) (the specification leaves roughness 0 to the renderer), V height-correlated
+    Smith. `specular` / 0.5 scales the reflection of the dielectric; 0.5 is the specification. The specification's
+    second form, one Fresnel term for the mixed f0, differs where 0 < metallic < 1.
+    """
     edge, lobe = _schlick(a.cos_d), _lobe(a, _alpha2(roughness))
     tint, white = _metal(lobe, metallic, edge)
     fresnel = (2 * specular) * dr.fma(1 - GLTF_F0, edge, GLTF_F0)
@@ -176,10 +161,8 @@ def layered(
 
     `albedo` and `f0` (of the dielectric) are colours; F(f0) = f0 + (f90 - f0)(1 - |wi·h|)^5, and the diffuse lobe loses
     its largest channel. `coat` is (strength, roughness); of index 1.5, it covers the base by its Fresnel term at the
-    normal. With f0 = 0.04, f90 = 1 and no coat it is `gltf`. Finite where `a.valid` is False.
+    normal. With f0 = 0.04, f90 = 1 and no coat it is `_gltf`. Finite where `a.valid` is False.
     """
-    import drjit as dr
-
     edge = _schlick(a.cos_d)
     lobe = _lobe(a, _alpha2(roughness))
     fresnel = f0 + (f90 - f0) * edge
@@ -195,8 +178,6 @@ def layered(
 
 def _lobe(a: Angles, alpha2: Any) -> Any:
     """GGX: D V cos(theta_o) with height-correlated Smith."""
-    import drjit as dr
-
     visible = a.cos_o * _smith_root(a.cos_i, alpha2) + a.cos_i * _smith_root(a.cos_o, alpha2)
     spread = dr.fma(alpha2, a.cos2_h, a.sin2_h)
     return alpha2 * a.cos_o / (2 * dr.pi * dr.square(spread) * visible)
@@ -212,44 +193,32 @@ def _metal(lobe: Any, metallic: Any, edge: Any) -> tuple[Any, Any]:
 
 
 def _alpha2(roughness: Any) -> Any:
-    import drjit as dr
-
     return dr.square(dr.maximum(dr.square(roughness), ALPHA_FLOOR))
 
 
 def _smith_root(cosine: Any, alpha2: Any) -> Any:
     """cos · sqrt(1 + alpha² tan²), finite at grazing angles."""
-    import drjit as dr
-
     return dr.sqrt(dr.fma(alpha2, 1 - dr.square(cosine), dr.square(cosine)))
 
 
 def _fresnel(cosine: Any, specular: float) -> Any:
     """Exact reflectance of a dielectric, unpolarised, from outside."""
-    import drjit as dr
-
     eta2 = (2 / (1 - (0.08 * specular) ** 0.5) - 1) ** 2
     g, inside = dr.sqrt(dr.fma(cosine, cosine, eta2 - 1)), eta2 * cosine
     return 0.5 * (dr.square((g - cosine) / (g + cosine)) + dr.square((inside - g) / (inside + g)))
 
 
 def _schlick(cosine: Any) -> Any:
-    import drjit as dr
-
     m = 1 - cosine
     return dr.square(dr.square(m)) * m
 
 
 def _shadow_terminator(normal_z: Any, wo_z: Any) -> Any:
     """Estevez et al. 2019, the bump terminator: attenuation of light at wo on a surface bumped by `normal_z`."""
-    import drjit as dr
-
     z2 = dr.maximum(dr.square(normal_z), 1e-12)
     alpha2 = dr.minimum(0.125 * (1 - z2) / z2, 1)
     return 2 / (1 + dr.sqrt(dr.fma(alpha2, (1 - dr.square(wo_z)) / dr.square(wo_z), 1)))
 
 
 def _dot(a: tuple, b: tuple) -> Any:
-    import drjit as dr
-
     return dr.fma(a[0], b[0], dr.fma(a[1], b[1], a[2] * b[2]))

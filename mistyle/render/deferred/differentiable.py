@@ -22,6 +22,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import split, torch_bridge
 from mistyle.render.deferred.image_samples import FrameKind, own, tangents_of
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import tracer
 
 # Default values of omitted maps: grey, flat, half rough, not metallic.
@@ -138,15 +139,11 @@ class Renderer:
         return self._taps[camera, sizes]
 
     def _plain_image(self, pixels: Float[np.ndarray, "n 8"], camera: int) -> Float[np.ndarray, "h w 3"]:
-        import mitsuba as mi
-
         packed = own(mi.Float, np.ascontiguousarray(pixels, np.float32).ravel())
         return np.array(split.radiance(self._lit[camera], packed)).reshape(*self.cameras[camera].size, 3)
 
     def _torch_image(self, tables: Sequence[Mapping[str, Any]], sizes, where: torch_bridge.Taps, camera: int) -> Any:
         """The fetch as a sparse product, whose gradient has a fixed order, then shading of each pixel."""
-        import drjit as dr
-        import mitsuba as mi
         import torch
 
         def column(table: Mapping[str, Any], name: str, size: tuple[int, int]) -> Any:
@@ -174,9 +171,6 @@ class Renderer:
 
     def _drjit_image(self, tables: Sequence[Mapping[str, Any]], sizes, where: torch_bridge.Taps, camera: int) -> Any:
         """The fetch by gathers, one channel at a time."""
-        import drjit as dr
-        import mitsuba as mi
-
         on, count = self._surfaces[camera].mask, len(self._surfaces[camera].mask)
         texel, weight = np.zeros((count, 4), np.uint32), np.zeros((count, 4), np.float32)
         texel[on] = where.texels[where.matrix.indices].reshape(-1, 4)
@@ -190,8 +184,7 @@ class Renderer:
             for k in range(channels):
                 taps = [dr.gather(mi.Float, whole, t * channels + k) * w for t, w in zip(texels, weights, strict=True)]
                 values.append(taps[0] + taps[1] + taps[2] + taps[3])
-        stack: Any = mi
-        image = split.radiance(self._lit[camera], dr.ravel(stack.ArrayXf(values)))
+        image = split.radiance(self._lit[camera], dr.ravel(mi.ArrayXf(values)))
         return mi.TensorXf(image, (*self.cameras[camera].size, 3))
 
 
@@ -221,8 +214,6 @@ def _is_torch(value: Any) -> bool:
 
 
 def _is_drjit(value: Any) -> bool:
-    import drjit as dr
-
     return bool(dr.is_tensor_v(value))
 
 
@@ -237,8 +228,6 @@ def _numpy_table(maps: Mapping[str, Any], size: tuple[int, int]) -> Float[np.nda
 
 def _drjit_map(value: Any, name: str, size: tuple[int, int]) -> Any:
     """The flat values of one map."""
-    import mitsuba as mi
-
     if value is None:
         value = np.broadcast_to(np.float32(NEUTRAL[name]), (size[0] * size[1], len(NEUTRAL[name])))
     return value.array if _is_drjit(value) else mi.Float(aligned(np.asarray(value, np.float32).ravel()))

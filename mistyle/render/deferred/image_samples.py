@@ -25,6 +25,7 @@ from mistyle.geometry.tangents import corner_tangents
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred.sky import VARIANTS, Sky, sky
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer
 
 FrameKind = Literal["mikkt", "mitsuba"]
@@ -265,9 +266,6 @@ def _block(
     soft: Sky | None,
 ) -> SampleBlock | None:
     """The block of a picture's rows from `row` on; `mask` selects its pixels. None without any sample."""
-    import drjit as dr
-    import mitsuba as mi
-
     width, subsamples = camera.size[1], sampling.subsamples
     chosen = np.flatnonzero(mask) + row * width
     if len(chosen) == 0:
@@ -325,9 +323,6 @@ def _trace(
     shadows: bool,
     soft: bool,
 ) -> _Traced:
-    import drjit as dr
-    import mitsuba as mi
-
     point, frame = deferred.intersect(surface.traced, ray, surface.tangents)
     wi = frame.to_local(-ray.d)
     valid = point.is_valid() & (wi.z != 0)
@@ -355,9 +350,6 @@ def _samples(
     shadows: bool,
 ) -> Samples:
     """The rays `lit_rays`, padded; `columns` are their slots, texels, steps and positions, see `Samples`."""
-    import drjit as dr
-    import mitsuba as mi
-
     slot, texel, step, place = columns
     size = padded(len(lit_rays))
     where = own(mi.UInt32, _pad(lit_rays, size))
@@ -393,8 +385,6 @@ def padded(count: int) -> int:
 
 def own(kind: Any, values: np.ndarray) -> Any:
     """A Dr.Jit array in its own memory: NumPy's alignment varies, and frozen functions depend on alignment."""
-    import drjit as dr
-
     return kind(aligned(values, values.dtype)) + dr.opaque(kind, 0)
 
 
@@ -406,9 +396,6 @@ def _pad(values: np.ndarray, size: int) -> np.ndarray:
 
 def camera_rays(camera: Camera, pixel: Any, x: Any, y: Any) -> Any:
     """Rays through the positions (x, y), 0..1, in the pixels (UInt32, row · width + column); unit directions."""
-    import drjit as dr
-    import mitsuba as mi
-
     width = camera.size[1]
     x = (mi.Float(pixel % width) + x - camera.centre[0]) / camera.focal
     y = (mi.Float(pixel // width) + y - camera.centre[1]) / camera.focal
@@ -420,9 +407,6 @@ def camera_rays(camera: Camera, pixel: Any, x: Any, y: Any) -> Any:
 
 def _arriving(traced, point, light, camera: Camera, valid, shadows: bool) -> tuple[Any, Any]:
     """World direction to a delta light, and the share of its colour that arrives."""
-    import drjit as dr
-    import mitsuba as mi
-
     if isinstance(light, Directional):
         direction = mi.Vector3f(direction_in_world(light, camera).tolist())
         strength, shadow = mi.Float(1), point.spawn_ray(direction)
@@ -446,9 +430,6 @@ def sky_parts(pixel, subsample, subsamples: int, width: int) -> Integer[np.ndarr
 
 def _visible(traced: Tracer, points: tuple[Any, Any, Any], variant: Any, soft: Sky, shadows: bool) -> Any:
     """The words of `Samples.visible`; `points`: position, geometric normal, shading normal on the camera's side."""
-    import drjit as dr
-    import mitsuba as mi
-
     position, normal, up = points
     point = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
     point.p, point.n = position, normal
@@ -474,7 +455,6 @@ def _colour(light: Directional | Point) -> tuple[float, float, float]:
 
 def _transpose(texel, step, place, sizes, size: int) -> tuple[Transpose, int]:
     """A counting sort by texel; samples of one texel stay in order, so its sum has a fixed order."""
-    import mitsuba as mi
     import scipy.sparse as sparse
 
     index, weight = bilinear_taps(texel, step, place, sizes)

@@ -18,6 +18,7 @@ from mistyle.core.camera import Camera
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import Ambient, Directional, Lights, Point, direction_in_world, position_in_world
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer
 
 INTEGRATOR = "mistyle_deferred"
@@ -72,9 +73,6 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
     `tangents` (per face corner, xyz and handedness, as MikkTSpace makes them) give the frame of the normal map that
     glTF viewers use. Without them it is Mitsuba's own: dp/du of each face, made perpendicular to the shading normal.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     device.use()
     if len({camera.size for camera in cameras}) != 1:
         raise ValueError(f"found cameras of sizes {sorted({camera.size for camera in cameras})}; expected one size")
@@ -103,8 +101,6 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
 
 def intersect(traced: Tracer, ray: Any, tangents: Float[np.ndarray, "f 3 4"] | None) -> tuple[Any, Any]:
     """First hits of rays on the mesh: Mitsuba's surface interaction, and the frame of the normal map (see `trace`)."""
-    import mitsuba as mi
-
     first = traced.scene.ray_intersect_preliminary(ray, coherent=True)
     point = first.compute_surface_interaction(ray, mi.RayFlags.All)
     if tangents is None:
@@ -146,9 +142,6 @@ def _lit(
     shadows: bool,
 ) -> Lit:
     """`beams` holds rows of one light per camera."""
-    import drjit as dr
-    import mitsuba as mi
-
     height, width = surface.cameras[0].size
     valid = surface.point.is_valid()
     camera_of = dr.arange(mi.UInt32, len(surface.mask)) // (height * width)
@@ -166,9 +159,6 @@ def _lit(
 
 def _beam(surface: Surface, row: Sequence[Directional] | Sequence[Point], camera_of: Any) -> tuple[Any, Any, Any]:
     """For one light per camera: unit directions towards it, irradiance at normal incidence, and shadow rays."""
-    import drjit as dr
-    import mitsuba as mi
-
     both = list(zip(row, surface.cameras, strict=True))
     if isinstance(row[0], Directional):
         towards = [direction_in_world(beam, camera) for beam, camera in both if isinstance(beam, Directional)]
@@ -190,9 +180,6 @@ def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[A
     mirror direction; each weight is one over the combined density (the balance heuristic). They are constant, so the
     sum has an error but no noise.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     side = dr.mulsign(mi.Float(1), wi.z)
     wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
     lobes, cosines = count // 2, count - count // 2
@@ -221,8 +208,6 @@ def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[A
 
 def register() -> None:
     """Register the plugin `mistyle_deferred` with the current variant of Mitsuba."""
-    import mitsuba as mi
-
     variant = device.use()
     if variant not in _registered:
         mi.register_integrator(INTEGRATOR, _integrator_class())
@@ -231,8 +216,6 @@ def register() -> None:
 
 def _integrator_class() -> type:
     """The integrator, as a class of the current variant's base."""
-    import drjit as dr
-    import mitsuba as mi
 
     class Deferred(mi.SamplingIntegrator):
         """Sums BSDF times irradiance at the points of `lit` (set before rendering) for the film's only shape."""
@@ -267,9 +250,6 @@ def _integrator_class() -> type:
 
 def _rays(cameras: Sequence[Camera]) -> Any:
     """Rays with unit directions through the pixel centres of equal cameras, camera after camera, row by row."""
-    import drjit as dr
-    import mitsuba as mi
-
     height, width = cameras[0].size
     lane = dr.arange(mi.UInt32, len(cameras) * height * width)
     camera_of, pixel = lane // (height * width), lane % (height * width)
@@ -285,9 +265,6 @@ def _rays(cameras: Sequence[Camera]) -> Any:
 
 def _each(kind: Any, values: Float[np.ndarray, "c 3"], camera_of: Any) -> Any:
     """A vector per camera, for each of its pixels."""
-    import drjit as dr
-    import mitsuba as mi
-
     return dr.gather(kind, mi.Float(aligned(values).ravel()), camera_of)
 
 
@@ -296,9 +273,6 @@ def tangent_frame(point: Any, barycentric: Any, corners: Any) -> Any:
 
     `corners` holds the tangents of all face corners (xyz and handedness), one after the other.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     valid = point.is_valid()
     tangent, hand = mi.Vector3f(0), mi.Float(1)
     weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)

@@ -26,6 +26,7 @@ from mistyle.render.deferred.material_table import (
     TILT_Y,
 )
 from mistyle.render.deferred.sky import VARIANTS, Sky
+from mistyle.render.mitsuba.device import dr, mi
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,6 @@ class BlockArrays:
 
 def _fetch(textures: Any, samples: Samples, moved: Sequence[Any] = (0, 0, 0)) -> list[Any]:
     """Interpolated albedo 3, normal 3, roughness, metallic of each sample; `moved` is added to tilt and roughness."""
-    import drjit as dr
-    import mitsuba as mi
-
     table, right, down = textures
     step = mi.UInt32(samples.step)
     right, down = dr.gather(mi.Int32, right, step), dr.gather(mi.Int32, down, step)
@@ -52,7 +50,7 @@ def _fetch(textures: Any, samples: Samples, moved: Sequence[Any] = (0, 0, 0)) ->
     for far_y, wy in ((0, 1 - y), (1, y)):
         for far_x, wx in ((0, 1 - x), (1, x)):
             index = corner + (right if far_x else 0) + (down if far_y else 0)
-            row = dr.gather(_packets(), table, mi.UInt32(index), shape=(8, dr.width(index)))
+            row = dr.gather(mi.ArrayXf, table, mi.UInt32(index), shape=(8, dr.width(index)))
             x_y = row[TILT_X] + moved[0], row[TILT_Y] + moved[1]
             values = [row[0], row[1], row[2], *x_y, _tilted_z(*x_y), row[ROUGHNESS] + moved[2], row[METALLIC]]
             weight = wx * wy
@@ -60,23 +58,12 @@ def _fetch(textures: Any, samples: Samples, moved: Sequence[Any] = (0, 0, 0)) ->
     return result
 
 
-def _packets() -> Any:
-    """The type of eight numbers a lane; Mitsuba's stubs lack it."""
-    import mitsuba as mi
-
-    return mi.ArrayXf
-
-
 def _tilted_z(x: Any, y: Any) -> Any:
-    import drjit as dr
-
     return dr.sqrt(dr.maximum(1 - dr.fma(x, x, y * y), LEAST_Z**2))
 
 
 def _delta_light(terms: Callable, values: list[Any], samples: Samples, colours: tuple) -> tuple[Any, Any]:
     """Albedo-linear and constant term of all delta lights: the radiance is albedo · linear + constant."""
-    import mitsuba as mi
-
     linear, constant = mi.Color3f(0), mi.Color3f(0)
     for wo, strength, colour in zip(samples.wo, samples.strength, colours, strict=True):
         p, g = terms(samples.wi, wo, mi.Vector3f(*values[NORMAL]), values[FETCHED_ROUGHNESS], values[FETCHED_METALLIC])
@@ -88,8 +75,6 @@ def _delta_light(terms: Callable, values: list[Any], samples: Samples, colours: 
 
 def _colour(terms: Callable, values: list[Any], samples: Samples, lights: tuple) -> Any:
     """Radiance of each sample towards the camera; differentiable only without soft light."""
-    import mitsuba as mi
-
     linear, constant = _delta_light(terms, values, samples, lights[0])
     if lights[1] is not None:
         soft = soft_light(terms, values, samples, lights[1])
@@ -99,9 +84,6 @@ def _colour(terms: Callable, values: list[Any], samples: Samples, lights: tuple)
 
 def image(terms, subsamples: int, textures, samples, pixels, lights) -> Any:
     """Packets (r, g, b, 0) of the lit pixels."""
-    import drjit as dr
-    import mitsuba as mi
-
     rgb = _resolve(_colour(terms, _fetch(textures, samples), samples, lights), pixels, subsamples)
     return dr.ravel(mi.Vector4f(rgb.x, rgb.y, rgb.z, 0))
 
@@ -110,9 +92,6 @@ def slopes(terms, subsamples: int, textures, samples, pixels, lights) -> tuple[A
     """Packets (r, g, b, 0) of the lit pixels under delta lights, and of their derivatives by a change that all texels
     share: of each channel by its own albedo, of all by both tilts and roughness. By forward mode: where reflectance is
     discontinuous they are those of its branch."""
-    import drjit as dr
-    import mitsuba as mi
-
     values = _fetch(textures, samples)
     linear, constant = _delta_light(terms, values, samples, lights[0])
     results = [mi.Color3f(*values[ALBEDO]) * linear + constant, linear]
@@ -128,9 +107,6 @@ def slopes(terms, subsamples: int, textures, samples, pixels, lights) -> tuple[A
 
 def _resolve(colour: Any, pixels: Pixels, subsamples: int) -> Any:
     """Mean over the samples of a pixel, in their order; samples that are not stored are black."""
-    import drjit as dr
-    import mitsuba as mi
-
     if subsamples == 1:
         return colour
     packed = dr.ravel(mi.Vector4f(colour.x, colour.y, colour.z, 0))
@@ -142,9 +118,6 @@ def _resolve(colour: Any, pixels: Pixels, subsamples: int) -> Any:
 
 def step(terms, subsamples, loss, textures, block: BlockArrays, goal) -> Any:
     """Loss over a block, and its rows of the gradient; `goal` is (packets of reference and weight, their factor)."""
-    import drjit as dr
-    import mitsuba as mi
-
     samples, pixels, lights = block.samples, block.pixels, block.lights
     values, (target, scale) = _fetch(textures, samples), goal
     packet = dr.gather(mi.Vector4f, target, dr.arange(mi.UInt32, dr.width(pixels.index)))
@@ -153,7 +126,7 @@ def step(terms, subsamples, loss, textures, block: BlockArrays, goal) -> Any:
         dr.enable_grad(values)
         lost = LOSSES[loss](_colour(terms, values, samples, lights), reference) * weight
         dr.backward(lost)
-        packed = dr.ravel(_packets()(dr.grad(values)))
+        packed = dr.ravel(mi.ArrayXf(dr.grad(values)))
     else:
         image = _resolve(_colour(terms, values, samples, lights), pixels, subsamples)
         dr.enable_grad(image)
@@ -170,9 +143,6 @@ def step(terms, subsamples, loss, textures, block: BlockArrays, goal) -> Any:
 
 def pull(terms, subsamples, textures, block: BlockArrays, adjoint) -> Any:
     """A block's rows of the gradient of a loss whose derivative by the picture is `adjoint`."""
-    import drjit as dr
-    import mitsuba as mi
-
     pixel = dr.gather(mi.UInt32, block.pixels.index, block.samples.slot)
     at = dr.gather(mi.Vector3f, adjoint, pixel) / subsamples
     derivatives = _derivatives(terms, textures, block.samples, block.lights, at)
@@ -181,9 +151,6 @@ def pull(terms, subsamples, textures, block: BlockArrays, adjoint) -> Any:
 
 def _derivatives(terms, textures, samples, lights, adjoint) -> Any:
     """Gradient of Σ adjoint · colour by the eight fetched values of each sample, in packets."""
-    import drjit as dr
-    import mitsuba as mi
-
     values = _fetch(textures, samples)
     derivatives: list[Any] = [mi.Float(0)] * 8
     if lights[0]:
@@ -195,20 +162,17 @@ def _derivatives(terms, textures, samples, lights, adjoint) -> Any:
     if lights[1] is not None:
         more = _soft_derivatives(terms, dr.detach(values), samples, lights[1], adjoint)
         derivatives = [a + b for a, b in zip(derivatives, more, strict=True)]
-    return dr.ravel(_packets()(derivatives))
+    return dr.ravel(mi.ArrayXf(derivatives))
 
 
 def _to_texels(table, packed, transpose) -> Any:
     """Per texel, the sum of weight · derivative over the samples that read it; then from (x, y, z) to the tilt."""
-    import drjit as dr
-    import mitsuba as mi
-
     width = dr.width(transpose.texel)
-    total = dr.zeros(_packets(), (8, width))
+    total = dr.zeros(mi.ArrayXf, (8, width))
 
     def add(k, total):
         weight, sample = dr.gather(mi.Float, transpose.weight, k), dr.gather(mi.UInt32, transpose.sample, k)
-        return k + 1, dr.fma(weight, dr.gather(_packets(), packed, sample, shape=(8, width)), total)
+        return k + 1, dr.fma(weight, dr.gather(mi.ArrayXf, packed, sample, shape=(8, width)), total)
 
     _, total = dr.while_loop((mi.UInt32(transpose.begin), total), lambda k, total: k < transpose.end, add)
     x, y = (
@@ -218,35 +182,26 @@ def _to_texels(table, packed, transpose) -> Any:
     z = _tilted_z(x, y)
     lean = dr.select(z > LEAST_Z, total[5] / z, 0)
     rows = [total[0], total[1], total[2], total[3] - lean * x, total[4] - lean * y, total[6], total[7], mi.Float(0)]
-    return dr.ravel(_packets()(rows))
+    return dr.ravel(mi.ArrayXf(rows))
 
 
 def add_rows(gradient: Any, rows: Any, transpose: Transpose) -> None:
     """Not frozen: a frozen function would copy the gradient, since the caller holds it too."""
-    import drjit as dr
-    import mitsuba as mi
-
     width = dr.width(transpose.texel)
-    values = dr.gather(_packets(), rows, dr.arange(mi.UInt32, width), shape=(8, width))
+    values = dr.gather(mi.ArrayXf, rows, dr.arange(mi.UInt32, width), shape=(8, width))
     used = transpose.begin < transpose.end
     dr.scatter_add(gradient, values, transpose.texel, active=used, mode=dr.ReduceMode.NoConflicts)
 
 
 def _l2(image: Any, reference: Any) -> Any:
-    import drjit as dr
-
     return dr.sum(dr.square(image - reference))
 
 
 def _log_srgb_l1(image: Any, reference: Any) -> Any:
-    import drjit as dr
-
     return dr.sum(dr.abs(_log_srgb(image) - _log_srgb(reference)))
 
 
 def _log_srgb(x: Any) -> Any:
-    import drjit as dr
-
     x = dr.log(1 + dr.maximum(x, 0))
     dark = x <= 0.0031308
     return dr.select(dark, 12.92 * x, 1.055 * dr.power(dr.select(dark, 1, x), 1 / 2.4) - 0.055)
@@ -263,9 +218,6 @@ LEAST_ALPHA = 0.01
 def upload(sky: Sky) -> tuple[Any, ...]:
     """A sky as Dr.Jit arrays: packets (direction 3, energy 3, solid angle, 0) of the cells' parts; packets (radiance 3,
     solid angle of the cell) of the map's pixels, and their cells; the numbers of cells and rows."""
-    import drjit as dr
-    import mitsuba as mi
-
     angle = np.broadcast_to(sky.angle[:, None, None], (*sky.direction.shape[:2], 1))
     cells = np.concatenate([sky.direction, sky.energy, angle, np.zeros_like(angle)], axis=-1)
     pixels = np.concatenate([sky.radiance, sky.angle[sky.cell][..., None]], axis=-1)
@@ -281,7 +233,6 @@ def soft_light(terms: Callable, values: list[Any], samples: Samples, sky: tuple)
     Both strategies cover all of the light; the balance heuristic combines them, with a cell's density 1 / solid angle.
     The lobe takes radiance from the map and visibility from the cell of the direction.
     """
-    import mitsuba as mi
 
     def add(total, wo, light):
         p, g = terms(samples.wi, wo, mi.Vector3f(*values[NORMAL]), values[FETCHED_ROUGHNESS], values[FETCHED_METALLIC])
@@ -293,9 +244,6 @@ def soft_light(terms: Callable, values: list[Any], samples: Samples, sky: tuple)
 
 def _soft_derivatives(terms, values: list[Any], samples: Samples, sky: tuple, adjoint: Any) -> list[Any]:
     """Gradient of Σ adjoint · colour by the fetched values, with fixed directions."""
-    import drjit as dr
-    import mitsuba as mi
-
     albedo = mi.Color3f(*values[ALBEDO])
 
     def add(total, wo, light):
@@ -312,9 +260,6 @@ def _soft_derivatives(terms, values: list[Any], samples: Samples, sky: tuple, ad
 
 def _over_sky(values: list[Any], samples: Samples, sky: tuple, total: list[Any], add: Callable) -> list[Any]:
     """`add(total, wo, light)` for every direction of incident light; light is zero where it is hidden."""
-    import drjit as dr
-    import mitsuba as mi
-
     cells, pixels, cell_of, count, rows = sky
     n = dr.width(samples.wi)
     s, t, up = samples.frame  # pyright: ignore[reportGeneralTypeIssues]
@@ -326,7 +271,7 @@ def _over_sky(values: list[Any], samples: Samples, sky: tuple, total: list[Any],
         return ((word >> (cell & 31)) & 1) != 0
 
     def cell(k, total):
-        row = dr.gather(_packets(), cells, k * VARIANTS + variant, shape=(8, n))
+        row = dr.gather(mi.ArrayXf, cells, k * VARIANTS + variant, shape=(8, n))
         world = mi.Vector3f(row[0], row[1], row[2])
         wo = mi.Vector3f(dr.dot(s, world), dr.dot(t, world), dr.dot(up, world))
         share = dr.rcp(1 + row[6] * LOBE_DIRECTIONS * lobe.density(wo))
@@ -350,9 +295,6 @@ class _Lobe:
     """GGX's visible normals about the mapped normal at fixed points; everything in the tangent frame, detached."""
 
     def __init__(self, values: list[Any], samples: Samples) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         self.normal = dr.normalize(mi.Vector3f(*values[NORMAL]))
         self.alpha = dr.maximum(dr.square(values[FETCHED_ROUGHNESS]), LEAST_ALPHA)
         wi = self.wi = samples.wi
@@ -367,8 +309,6 @@ class _Lobe:
 
     def density(self, wo: Any) -> Any:
         """Per solid angle of wo: D(h) G1(wi) / (4 cos θ_i)."""
-        import drjit as dr
-
         half = dr.normalize(self.wi + wo)
         c2, a2 = dr.square(dr.dot(half, self.normal)), dr.square(self.alpha)
         spread = a2 / (dr.pi * dr.square(dr.fma(c2, a2 - 1, 1)))
@@ -377,9 +317,6 @@ class _Lobe:
 
     def direction(self, k: Any) -> tuple[Any, Any]:
         """The k-th of LOBE_DIRECTIONS fixed directions and its density (Dupuy and Benyoub 2023, spherical caps)."""
-        import drjit as dr
-        import mitsuba as mi
-
         v = dr.normalize(mi.Vector3f(self.alpha * self.sine, 0, self.cosine))
         along = (mi.Float(k) + (self.variant + 0.5) / VARIANTS) / LOBE_DIRECTIONS
         z = dr.fma(1 - along, 1 + v.z, -v.z)
@@ -396,9 +333,6 @@ class _Lobe:
 
 def _pixel(world: Any, rows: int) -> Any:
     """Radiance of the sky's map (`render/deferred/sky.py`) in the direction `world`."""
-    import drjit as dr
-    import mitsuba as mi
-
     row = dr.acos(dr.clip(world.y, -1, 1)) * (rows / dr.pi)
     turn = dr.atan2(world.x, -world.z) * (rows / dr.pi)
     column = dr.select(turn < 0, turn + 2 * rows, turn)

@@ -31,6 +31,7 @@ from mistyle.render.deferred import image_samples as collecting
 from mistyle.render.deferred.material_table import COLUMNS
 from mistyle.render.deferred.sky import Sky, sky
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer
 
 Loss = Literal["l2", "log_srgb_l1"]
@@ -108,9 +109,6 @@ class MaterialRenderer:
 
     def upload(self, table: Any) -> Any:
         """The table (NumPy, TensorXf or Float) as a Dr.Jit Float, for the other methods."""
-        import drjit as dr
-        import mitsuba as mi
-
         if isinstance(table, mi.TensorXf):
             table = table.array
         elif not isinstance(table, mi.Float):
@@ -126,9 +124,6 @@ class MaterialRenderer:
 
         Cameras, lights and masks of `captures` must be unchanged.
         """
-        import mitsuba
-
-        mi: Any = mitsuba
         self.captures, self.weights = captures, weights
         for k in self._cache if pictures is None else pictures:
             if k not in self._cache:
@@ -198,9 +193,6 @@ class MaterialRenderer:
         """
         if loss not in kernels.LOSSES:
             raise ValueError(f"loss is {loss!r}; expected one of {', '.join(kernels.LOSSES)}")
-        import drjit as dr
-        import mitsuba as mi
-
         gradient, total, textures = self._empty_gradient(), mi.Float(0), self._textures(table)
         for k in pictures:
             for block in self.blocks(k):
@@ -218,8 +210,6 @@ class MaterialRenderer:
 
         `adjoint` is NumPy, torch (on the CPU) or a Dr.Jit tensor.
         """
-        import mitsuba as mi
-
         gradient, textures = self._empty_gradient(), self._textures(table)
         values = mi.Float(mi.TensorXf(adjoint).array)
         for block in self.blocks(picture):
@@ -238,18 +228,12 @@ class MaterialRenderer:
         return sum(f.n_recordings for f in self._frozen.values())
 
     def _empty_gradient(self) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         gradient = dr.zeros(mi.Float, COLUMNS * self.texels)
         dr.make_opaque(gradient)
         return gradient
 
     def _scale(self, value: float) -> Any:
         """An opaque number: a literal in a frozen function would be recorded again for each value."""
-        import drjit as dr
-        import mitsuba as mi
-
         return dr.opaque(mi.Float, float(value))
 
     def _function(self, block: "Block", name: str, function: Callable, *fixed: Any) -> Any:
@@ -310,9 +294,6 @@ class Block:
     """Hits of a block of a picture, with the pixels of its reference."""
 
     def __init__(self, hits: collecting.SampleBlock, soft_light: Any, rgb: np.ndarray, weights: np.ndarray) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         lit = hits.counts[1]
         self.hits = hits
         self.pixel = np.array(hits.pixels.index)[:lit]
@@ -338,9 +319,6 @@ class Block:
 
 
 def _steps(sizes: Sequence[tuple[int, int]]) -> tuple[Any, Any]:
-    import drjit as dr
-    import mitsuba as mi
-
     right, down = (mi.Int32(aligned(column, np.int32)) for column in collecting.steps(sizes).T)
     dr.make_opaque(right, down)
     return right, down

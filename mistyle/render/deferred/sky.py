@@ -13,15 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.light import (
-    SOFT,
-    Ambient,
-    Environment,
-    Light,
-    SphericalGaussian,
-    environment_radiance,
-    spherical_gaussian,
-)
+from mistyle.core.light import SOFT, Environment, Light, soft_radiance
 
 REC709 = np.array([0.2126, 0.7152, 0.0722])
 # Rows of the map: coarser environments are interpolated, finer ones averaged.
@@ -128,7 +120,7 @@ def _map(soft: Sequence[Light]) -> tuple[Float[np.ndarray, "h w 3"], Float[np.nd
     finest = max((len(light.radiance) for light in soft if isinstance(light, Environment)), default=LEAST_ROWS)
     rows = int(np.clip(finest, LEAST_ROWS, MOST_ROWS))
     fine = -(-finest // rows)
-    radiance = _radiance(soft, _directions(rows * fine))
+    radiance = soft_radiance(soft, _directions(rows * fine))
     edges = np.cos(np.arange(rows + 1) / rows * np.pi)
     angle = np.repeat(((edges[:-1] - edges[1:]) * np.pi / rows)[:, None], 2 * rows, axis=1)
     return radiance.reshape(rows, fine, 2 * rows, fine, 3).mean(axis=(1, 3)), angle
@@ -158,18 +150,6 @@ def _directions(rows: int) -> Float[np.ndarray, "h w 3"]:
     theta, phi = (np.arange(rows) + 0.5) / rows * np.pi, (np.arange(2 * rows) + 0.5) / rows * np.pi
     sin, cos = np.sin(theta)[:, None], np.cos(theta)[:, None]
     return np.stack([np.sin(phi) * sin, np.broadcast_to(cos, (rows, 2 * rows)), -np.cos(phi) * sin], axis=-1)
-
-
-def _radiance(lights: Sequence[Light], directions: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    result = np.zeros(directions.shape)
-    for light in lights:
-        if isinstance(light, Ambient):
-            result += np.asarray(light.radiance)
-        elif isinstance(light, SphericalGaussian):
-            result += spherical_gaussian(light, directions)
-        elif isinstance(light, Environment):
-            result += environment_radiance(light, directions)
-    return result
 
 
 def _cut(share: Float[np.ndarray, "h w"], count: int, start: int, whole: int) -> list[tuple[int, int, int, int]]:

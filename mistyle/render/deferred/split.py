@@ -21,6 +21,7 @@ from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred.image_samples import own
 from mistyle.render.deferred.material_table import ALBEDO, FETCHED_METALLIC, FETCHED_ROUGHNESS, NORMAL
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 
 COLUMNS = {
     "albedo": ALBEDO,
@@ -54,8 +55,6 @@ class Split:
         moving: tuple[str, ...],
     ) -> Float[np.ndarray, "n 8"]:
         """Gradient by the materials of a loss whose derivative by the picture is `adjoint`; 0 for maps not `moving`."""
-        import mitsuba as mi
-
         run = self._function(("pull", moving), lit, _pull, moving)
         return np.array(run(*_arrays(lit, materials), own(mi.Float, adjoint.ravel()))).reshape(-1, 8)
 
@@ -81,16 +80,11 @@ def radiance(lit: deferred.Lit, packed: Any) -> Any:
 
 
 def _arrays(lit: deferred.Lit, materials: Float[np.ndarray, "n 8"]) -> tuple[Any, ...]:
-    import mitsuba as mi
-
     return _film(lit), own(mi.Float, np.ascontiguousarray(materials, np.float32).ravel())
 
 
 def _film(lit: deferred.Lit) -> tuple[Any, Any, Any, Any]:
     """(wi, mask, directional lights, ambient light) of a lit film."""
-    import drjit as dr
-    import mitsuba as mi
-
     # Opaque, since a literal would be a constant of the recording.
     ambient = None if lit.ambient is None else mi.Color3f(*(dr.opaque(mi.Float, c) for c in lit.ambient))
     return lit.wi, lit.mask, list(lit.directional), ambient
@@ -105,9 +99,6 @@ def _lights(wi: Any, directional: list[Any], ambient: Any) -> Iterator[tuple[Any
 
 def _image(terms: Callable, film: tuple, packed) -> Any:
     """`film` is (wi, mask, directional lights, ambient light), as in `integrator.Lit`."""
-    import drjit as dr
-    import mitsuba as mi
-
     wi, mask, directional, ambient = film
     v = _values(packed, wi)
     linear, constant = mi.Color3f(0), mi.Color3f(0)
@@ -119,10 +110,6 @@ def _image(terms: Callable, film: tuple, packed) -> Any:
 
 def _pull(terms: Callable, moving: tuple[str, ...], film: tuple, packed, adjoint) -> Any:
     """Light by light, so that each has its own short gradient; directions are fixed."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba  # its stubs do not know ArrayXf
     wi, mask, directional, ambient = film
     v = _values(packed, wi)
     albedo, lane = mi.Color3f(*v[ALBEDO]), dr.arange(mi.UInt32, dr.width(wi))
@@ -145,10 +132,6 @@ def _pull(terms: Callable, moving: tuple[str, ...], film: tuple, packed, adjoint
 
 
 def _values(packed: Any, wi: Any) -> list[Any]:
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba  # its stubs do not know ArrayXf
     lane = dr.arange(mi.UInt32, dr.width(wi))
     row = dr.gather(mi.ArrayXf, packed, lane, shape=(8, dr.width(wi)))
     return [row[k] for k in range(8)]

@@ -26,6 +26,7 @@ from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import split
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.device import dr, mi
 
 CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
 Bridge = Literal["frozen", "wrap"]
@@ -110,9 +111,6 @@ class _Wrapped:
     """A Mitsuba scene with textures as large as the film, differentiated through `dr.wrap`."""
 
     def __init__(self, size: tuple[int, int], gloss: bool) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         device.use()
         deferred.register()
         bsdf = scenery.bsdf_dict(flat_maps(2))
@@ -137,7 +135,6 @@ class _Wrapped:
         self._render = dr.wrap(source="torch", target="drjit")(self._draw)
 
     def __call__(self, lit: deferred.Lit, pixels: Any, moving: Sequence[str]) -> Any:
-        import mitsuba as mi
         import torch
 
         self.integrator.lit = lit
@@ -158,15 +155,12 @@ class _Wrapped:
         return self._render(optimised).clone()
 
     def _draw(self, moving: dict[str, Any]) -> Any:
-        import mitsuba as mi
-
         for name, values in moving.items():
             self.parameters[self.names[name]] = mi.TensorXf(values)
         self.parameters.update()
         return mi.render(self.scene, self.parameters, spp=1, seed=mi.UInt32(0))
 
     def _still(self) -> Any:
-        import mitsuba as mi
         import torch
 
         self.parameters.update()

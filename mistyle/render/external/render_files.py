@@ -15,6 +15,9 @@ from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.core.image import resize
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
+from mistyle.render.lookdev import scenes as lookdev
+from mistyle.render.lookdev.scenes import material_maps
+from mistyle.render.mitsuba.scene_folder import write_scene
 
 TIMEOUT = 6 * 3600.0
 
@@ -42,9 +45,6 @@ class Subject:
 
 def exported(subject: Subject, shot: RenderView) -> Path:
     """The shot as a Mitsuba scene file that any Mitsuba renders, with Mitsuba's own material."""
-    from mistyle.render.lookdev.scenes import material_maps
-    from mistyle.render.mitsuba.scene_folder import write_scene
-
     folder = subject.folder / f"scene_{shot.name}"
     if not (folder / "scene.xml").is_file():
         folder.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,6 @@ def as_glb(subject: Subject) -> Path:
 def write_asset_glb(path: Path, asset: Any) -> None:
     """Write an asset with its own material by our exporters: a glTF is patched, any other format written anew."""
     from mistyle.io.gltf.write import patch_glb, write_glb
-    from mistyle.render.lookdev.scenes import material_maps
 
     maps = [_of_one_size(material_maps(m)) for m in asset.materials]
     occlusion = [np.ones(m.roughness.shape, np.float32) for m in maps]
@@ -104,7 +103,6 @@ def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     if subject.asset is None or shot.camera is None:
         return subject.path.resolve()
     from mistyle.io.images.write import write_exr
-    from mistyle.render.lookdev import scenes as lookdev
 
     xml = exported(subject, shot)
     sky = xml.with_name("blender_environment.exr")

@@ -33,6 +33,9 @@ from mistyle.render.external.render_files import (
     scene_for,
     user_camera,
 )
+from mistyle.render.lookdev import scenes as lookdev
+from mistyle.render.lookdev.scenes import asset_shapes, file_scene, integrator_dict, light_rig
+from mistyle.render.mitsuba.scene import passes
 
 MITSUBA_VARIANTS = ("cuda_ad_rgb", "metal_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 
@@ -139,13 +142,10 @@ def left_out(source: Subject) -> list[str]:
 def shots(source: Subject, lights: Sequence[str], views: int, size: int) -> list[RenderView]:
     """Cameras around a mesh under every light, or the sensors of a scene file."""
     if source.asset is None:
-        from mistyle.render.lookdev.scenes import file_scene
-
         names = [s.id() for s in file_scene(source.path).sensors()]
         usable = [n if n and not n.startswith(("__", "object_")) else f"sensor{k}" for k, n in enumerate(names)]
         return [RenderView(name, sensor=k) for k, name in enumerate(usable)]
     from mistyle.io.read import read_radiance
-    from mistyle.render.lookdev.scenes import light_rig
 
     cameras = [orbit(35 + 360 * k / views, 15, distance=4, fov=30, size=(size, size)) for k in range(views)]
     result = []
@@ -158,8 +158,6 @@ def shots(source: Subject, lights: Sequence[str], views: int, size: int) -> list
 
 def _mitsuba(integrator: str, source: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from importlib.metadata import version
-
-    from mistyle.render.lookdev import scenes as lookdev
 
     own = _integrator(integrator, source)
     if source.asset is None or source.export:
@@ -182,8 +180,6 @@ def _integrator(name: str, source: Subject) -> dict[str, Any] | None:
     """For a scene file the plugin with its defaults (None: its own); for a mesh one with hidden emitters."""
     if name == "scene":
         return None
-    from mistyle.render.lookdev.scenes import integrator_dict
-
     return {"type": name} if source.asset is None else integrator_dict(name)
 
 
@@ -192,7 +188,6 @@ _SHAPES: list[tuple[Any, Any]] = []
 
 
 def _shapes(source: Subject) -> Any:
-    from mistyle.render.lookdev.scenes import asset_shapes
 
     if not _SHAPES or _SHAPES[0][0] is not source.asset:
         _SHAPES[:] = [(source.asset, asset_shapes(source.asset))]
@@ -203,8 +198,6 @@ def _worker(
     python: str, integrator: str, source: Subject, shot: RenderView, spp: int, seeds: Sequence[int]
 ) -> Rendered:
     from mistyle.io.read import read_npy
-    from mistyle.render.lookdev import scenes as lookdev
-    from mistyle.render.mitsuba.scene import passes
 
     path = source.path if source.asset is None else exported(source, shot)
     times, each = passes(spp)
@@ -226,7 +219,6 @@ def _worker(
 def _cycles(python: str, source: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from mistyle.io.images.write import write_exr
     from mistyle.io.read import read_frame
-    from mistyle.render.lookdev import scenes as lookdev
 
     if shot.camera is None or source.asset is None:
         raise UsageError(f"{source.path}: Cycles reads no Mitsuba scenes; pass a GLB")

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.scene import passes
 
 
@@ -14,8 +15,6 @@ def sensor_picture(
 ) -> Float[np.ndarray, "h w 3"]:
     """Linear Rec.709 from sensor number `sensor`, at least `spp` samples a pixel, by `integrator` or the scene's
     own."""
-    import mitsuba as mi
-
     device.use()
     times, each = passes(spp)
     total: Any = 0
@@ -28,7 +27,4 @@ def sensor_picture(
 
 def values(scene: Any) -> dict[str, Any]:
     """Every parameter of a scene as it is now, by key, textures and meshes included: the inputs of a fit."""
-    import drjit as dr
-    import mitsuba as mi
-
     return {key: np.array(v) if dr.is_array_v(v) else str(v) for key, v in mi.traverse(scene)}

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from mistyle.core.errors import UsageError
 from mistyle.render.live import reach as scene_reach
 from mistyle.render.live import walk as scene_walk
+from mistyle.render.mitsuba.device import dr, mi
 
 ROUGHNESS_FLOOR = 0.04
 # `principled` clamps alpha = roughness^2 at 0.001; below, its derivative is exactly zero.
@@ -70,8 +71,6 @@ def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
 
     `engine` is the integrator for the gradients (`gradients.ad_integrator`); None means `prb`.
     """
-    import mitsuba as mi
-
     table = mi.traverse(scene)
     children = scene_walk.children(scene)
     ways = scene_walk.ways(scene, children)
@@ -214,8 +213,6 @@ def fast_shapes(scene: Any, integrator: Any = None) -> dict[str, str | None]:
     They have a plain `principled`, alone or in `twosided` and `normalmap`. All lights are points or directions, and the
     integrator renders direct light only (max_depth 2).
     """
-    import mitsuba as mi
-
     children = scene_walk.children(scene)
     engine = scene.integrator() if integrator is None else integrator
     depth = getattr(engine, "max_depth", None)
@@ -264,8 +261,6 @@ def _unknown(listed: Sequence[Parameter], pattern: str) -> str:
 
 
 def _kind(node: Any, leaf: str, shape: tuple[int, ...]) -> str:
-    import mitsuba as mi
-
     if isinstance(node, mi.Shape):
         attribute = leaf.startswith(("vertex_", "face_")) and leaf not in GEOMETRY
         return "attribute" if attribute else "geometry"
@@ -276,8 +271,6 @@ def _kind(node: Any, leaf: str, shape: tuple[int, ...]) -> str:
 
 def _storage(value: Any) -> str:
     """The numbers' type; "python" for numbers outside Dr.Jit, else the class's name."""
-    import drjit as dr
-
     kind = type(value)
     if isinstance(value, (bool, int, float, str)):
         return "python"
@@ -287,8 +280,6 @@ def _storage(value: Any) -> str:
 
 
 def _reason(node: Any, owner: Any, role: str, kind: str, flags: Any, value: Any, storage: str) -> str | None:
-    import mitsuba as mi
-
     if kind == "geometry":
         return "it is geometry; only materials and lights can be fitted."
     if isinstance(node, (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.Scene)):

@@ -9,6 +9,8 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mistyle.render.mitsuba.device import mi
+
 Children = Mapping[Any, list[tuple[str, Any]]]
 
 # Roles that determine the probabilities of lobes under attached sampling.
@@ -30,8 +32,6 @@ def below(node: Any, held: Children) -> Iterator[tuple[str, Any, Any]]:
 
 def drawn(scene: Any, held: Children) -> set[Any]:
     """The plugins that rendering reads: shapes, lights, cameras, integrators and their descendants."""
-    import mitsuba as mi
-
     kinds = (mi.Shape, mi.Emitter, mi.Sensor, mi.Integrator)
     roots = [child for _, child in held[scene] if isinstance(child, kinds)]
     return {scene, *roots, *(child for root in roots for _, _, child in below(root, held))}
@@ -49,8 +49,6 @@ def readers(shape: Any, attribute: str, held: Children) -> list[tuple[str, Any]]
 
 def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:
     """Why the integrator has no correct gradient of a parameter; None if it has. `engine` None: `prb`."""
-    import mitsuba as mi
-
     detached = engine is None or isinstance(engine, mi.ad.integrators.common.ADIntegrator)
     called = "prb" if engine is None else str(engine).partition("[")[0].removesuffix("Integrator").lower()
     inside = isinstance(owner, (mi.Medium, mi.PhaseFunction)) or isinstance(node, mi.Volume)

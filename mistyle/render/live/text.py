@@ -10,12 +10,11 @@ import numpy as np
 
 from mistyle.render.live.parameters import Parameter
 from mistyle.render.live.source import Edit, Element, elements_of
+from mistyle.render.mitsuba.device import mi
 
 
 def children(node: Any) -> list[tuple[str, int]]:
     """Property names and node numbers of a parsed node's children, in the file's order."""
-    import mitsuba as mi
-
     kind = mi.Properties.Type.ResolvedReference
     return [(name, node.props[name].index()) for name in node.props.keys() if node.props.type(name) == kind]
 
@@ -44,8 +43,6 @@ def _find(state: Any, p: Parameter) -> tuple[Any, str | None] | None:
 
 def _child(state: Any, node: Any, name: str) -> int | None:
     """The child with the `mi.traverse` name `name`: by its name in the file, else the n-th material, the emitter, …"""
-    import mitsuba as mi
-
     held = children(node)
     for called, index in held:
         if called == name:

@@ -4,12 +4,13 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
+from mistyle.render.mitsuba.device import mi
+
 MAX_NAMES = 64
 
 
 def children(scene: Any) -> dict[Any, list[tuple[str, Any]]]:
     """Every plugin's children with their names, each child once per plugin."""
-    import mitsuba as mi
 
     class Listing(mi.TraversalCallback):
         def __init__(self) -> None:

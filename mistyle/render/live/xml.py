@@ -19,6 +19,7 @@ from mistyle.render.live import source as scene_source
 from mistyle.render.live import text as scene_text
 from mistyle.render.live.parameters import Parameter
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import mi
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,11 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
     textures are named by their users, because Mitsuba names both by an address. The file is trusted: Mitsuba opens all
     files that it names. Raises InputRefused with Mitsuba's message if it cannot be loaded.
     """
-    import mitsuba as mi
-
     file = Path(path)
     if not file.is_file():
         raise InputRefused(f"{file}: no such scene file.")
     parameters = {name: str(value) for name, value in (defines or {}).items()}
-    config: Any = mi.parser.ParserConfig(device.use())
+    config = mi.parser.ParserConfig(device.use())
     config.merge_equivalent = config.merge_meshes = False
     try:
         with _relative_to(file), device.file_threads():
@@ -85,8 +84,6 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
 
 def _parsed(config: Any, file: Path, defines: dict[str, str]) -> tuple[Any, list[str]]:
     """The parsed and prepared file, and the converted bitmaps."""
-    import mitsuba as mi
-
     state = mi.parser.parse_file(config, str(file), **defines)
     mi.parser.transform_all(config, state)
     converted = _as_floats(state)
@@ -97,17 +94,14 @@ def _parsed(config: Any, file: Path, defines: dict[str, str]) -> tuple[Any, list
 @contextmanager
 def _relative_to(file: Path) -> Iterator[None]:
     """Resolve relative paths beside the file, as `mi.load_file` does."""
-    import mitsuba as mi
-
-    door: Any = mi
-    resolver = door.file_resolver()
-    inner = door.FileResolver(resolver)
+    resolver = mi.file_resolver()
+    inner = mi.FileResolver(resolver)
     inner.prepend(str(file.parent.resolve()))
-    door.set_file_resolver(inner)
+    mi.set_file_resolver(inner)
     try:
         yield
     finally:
-        door.set_file_resolver(resolver)
+        mi.set_file_resolver(resolver)
 
 
 def _as_floats(state: Any) -> list[str]:
@@ -122,8 +116,6 @@ def _as_floats(state: Any) -> list[str]:
 
 def _assign_ids(state: Any) -> None:
     """Give the scene's children ids, and remove textures that are reachable through their users."""
-    import mitsuba as mi
-
     root = state.nodes[0]
     used = {index for node in state.nodes[1:] for _, index in scene_text.children(node)}
     taken = {node.props.id() for node in state.nodes}
@@ -214,8 +206,6 @@ def _write_value(
     out: Path, stem: str, p: Parameter, values: np.ndarray, write_exr: Callable[..., None], scene: Any
 ) -> dict[str, Path]:
     """Write an image as EXR, or a mesh's attribute as PLY in world space; numbers and colours need no file."""
-    import mitsuba as mi
-
     if p.kind == "texture" and values.ndim == 3 and values.shape[2] <= 4:
         file = out.with_name(f"{out.stem}_{stem}.exr")
         shown = _without_seam(values) if p.owner == "EnvironmentMapEmitter" else values
@@ -227,7 +217,7 @@ def _write_value(
         return {}
     if p.kind == "attribute":
         file = out.with_name(f"{out.stem}_{stem}.ply")
-        node: Any = mi.traverse(scene).properties[p.key][2]
+        node = mi.traverse(scene).properties[p.key][2]
         with device.file_threads():
             node.write_ply(str(file))
         return {p.key: file}
@@ -243,8 +233,6 @@ def _without_seam(values: np.ndarray) -> np.ndarray:
 
 def _differences(out: Path, fitted: Any, left_out: set[str]) -> str:
     """Load the written file; the first difference, or an empty string."""
-    import mitsuba as mi
-
     try:
         loaded = load_scene_for_fit(out)
     except InputRefused as error:

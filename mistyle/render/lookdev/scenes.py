@@ -13,21 +13,22 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset, Material
 from mistyle.core.camera import Camera
+from mistyle.core.errors import InputRefused
 from mistyle.core.light import (
+    SOFT,
     Ambient,
     Directional,
     Environment,
     Light,
     Lights,
-    SphericalGaussian,
     direction_in_world,
-    environment_radiance,
-    spherical_gaussian,
+    soft_radiance,
 )
 from mistyle.core.maps import OwnMaps
 from mistyle.core.paths import PACKAGE, scenes
 from mistyle.process import stopping
 from mistyle.render.mitsuba import appearance, device
+from mistyle.render.mitsuba.device import mi
 from mistyle.render.mitsuba.emitters import emitters
 from mistyle.render.mitsuba.scene import passes, sensor_dict
 
@@ -89,8 +90,6 @@ def asset_shapes(asset: Asset) -> dict[str, Any]:
 
 def asset_scene(shapes: dict[str, Any], camera: Camera, lights: Sequence[Light], integrator: str) -> Any:
     """A loaded `mi.Scene` whose environment lights the asset but is invisible. `integrator` is "path" or "direct"."""
-    import mitsuba as mi
-
     device.use()
     own = integrator in OWN and appearance.needs_path(shapes)
     chosen = appearance.integrator(OWN[integrator]) if own else integrator_dict(integrator)
@@ -112,10 +111,6 @@ def integrator_dict(name: str) -> dict[str, Any]:
 
 def file_scene(path: Path) -> Any:
     """A Mitsuba scene file as `mi.load_file` loads it. The file is trusted: Mitsuba opens all files that it names."""
-    import mitsuba as mi
-
-    from mistyle.core.errors import InputRefused
-
     device.use()
     try:
         with device.file_threads():
@@ -135,8 +130,6 @@ def drawn(
 
     `integrator` None: the scene's own.
     """
-    import mitsuba as mi
-
     device.use()
     times, each = passes(spp)
     total: Any = 0
@@ -162,20 +155,11 @@ def blender_environment(lights: Sequence[Light]) -> Float[np.ndarray, "h w 3"]:
 
     Cycles: u = 0.5 - atan2(y, x) / 2π, v = 0.5 + asin(z) / π with Z up; the importer takes (x, y, z) to (x, -z, y).
     """
-    soft = [x for x in lights if isinstance(x, Ambient | Environment | SphericalGaussian)]
+    soft = [x for x in lights if isinstance(x, SOFT)]
     height = max([ROWS, *(len(x.radiance) for x in soft if isinstance(x, Environment))])
     if all(isinstance(x, Ambient) for x in soft):
         height = 4
     u, v = (np.arange(2 * height) + 0.5) / (2 * height), 1 - (np.arange(height) + 0.5) / height
     turn, rise = (0.5 - u) * 2 * np.pi, ((v - 0.5) * np.pi)[:, None]
     x, y, z = np.cos(turn) * np.cos(rise), np.sin(turn) * np.cos(rise), np.sin(rise) + 0 * turn
-    directions = np.stack([x, z, -y], axis=-1)
-    total = np.zeros(directions.shape)
-    for light in soft:
-        if isinstance(light, Ambient):
-            total += np.asarray(light.radiance)
-        elif isinstance(light, Environment):
-            total += environment_radiance(light, directions)
-        else:
-            total += spherical_gaussian(light, directions)
-    return total.astype(np.float32)
+    return soft_radiance(soft, np.stack([x, z, -y], axis=-1)).astype(np.float32)

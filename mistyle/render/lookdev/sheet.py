@@ -20,6 +20,7 @@ from mistyle.core.image import luminance
 from mistyle.core.light import Ambient, Environment, SphericalGaussian, bake_environment, environment_directions
 from mistyle.render.lookdev.scenes import asset_scene, asset_shapes, drawn, light_rig
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import mi
 
 GREY = 0.18
 FOV = 30.0
@@ -115,14 +116,12 @@ def column_camera(scale: float = 1.0) -> Camera:
 
 def reference_shapes() -> dict[str, Any]:
     """Mitsuba shapes of the two balls and the chart, in the plane z = 0, facing +Z."""
-    import mitsuba as mi
-
     device.use()
 
     def rgb(value: float) -> dict[str, Any]:
         return {"type": "rgb", "value": [value] * 3}
 
-    to: Any = mi.ScalarTransform4f
+    to = mi.ScalarTransform4f
     shapes: dict[str, Any] = {}
     materials = {
         "grey": {"type": "diffuse", "reflectance": rgb(GREY)},

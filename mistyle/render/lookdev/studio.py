@@ -30,6 +30,7 @@ from mistyle.process import memory
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred.image_samples import window
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer
 
 # Perceptual roughness of the prefiltered maps. The first is the light itself; the last equals irradiance / pi, since
@@ -74,11 +75,6 @@ def _resized(radiance: Float[np.ndarray, "h w 3"], rows: int) -> Float[np.ndarra
 
 def _filtered(radiance: Float[np.ndarray, "h w 3"], alpha: float) -> Float[np.ndarray, "h w 3"]:
     """The map of mean radiance under a GGX lobe of `alpha` that is seen along its axis."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba  # its type stubs know one variant only
-
     height, width = radiance.shape[:2]
     # Rows lie at both poles: those cover half a band.
     edge = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0, 1) * np.pi
@@ -128,10 +124,6 @@ class Studio:
 
     def __init__(self, traced: Tracer, light: np.ndarray, sky: StudioSky, looks: Sequence[Sequence[Maps]]) -> None:
         """`light` is `prefiltered`; `looks` are one `Maps` per texture set each; sets of a look may differ in size."""
-        import mitsuba
-
-        mi: Any = mitsuba  # its type stubs know one variant only
-
         device.use()
         self._traced, self._mesh = traced, traced.mesh
         self._light = mi.Float(aligned(light.ravel()))
@@ -142,10 +134,6 @@ class Studio:
 
     def _uploaded(self, look: Sequence[Maps]) -> tuple[Any, ...]:
         """Texels, and for each set its offset, rows and columns."""
-        import mitsuba
-
-        mi: Any = mitsuba  # its type stubs know one variant only
-
         sizes = [m.roughness.shape for m in look]
         first = np.cumsum([0, *(h * w for h, w in sizes)])
         texels = np.empty((int(first[-1]), 2), np.uint32)
@@ -164,11 +152,6 @@ class Studio:
             yield self._drawn(camera, chosen, spp)
 
     def _drawn(self, camera: Camera, looks: Sequence[tuple[Any, ...]], spp: int) -> list[Float[np.ndarray, "h w 4"]]:
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba  # its type stubs know one variant only
-
         down, across = window(self._mesh, camera)
         height, width = down.stop - down.start, across.stop - across.start
         result = [np.zeros((*camera.size, 4), np.float32) for _ in looks]
@@ -206,11 +189,6 @@ class Studio:
 
     def _shaded(self, ray: Any, turn: Sequence[Any], looks: Sequence[tuple[Any, ...]]) -> list[Any]:
         """(r, g, b, 1) of the ray's hit, by look; zero without a hit."""
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba  # its type stubs know one variant only
-
         first = self._traced.scene.ray_intersect_preliminary(ray, coherent=True)
         point = first.compute_surface_interaction(ray, mi.RayFlags.All)
         valid = point.is_valid()
@@ -235,7 +213,7 @@ class Studio:
             mirrored = ray.d + 2 * cosine * tilted
             soft = self._fetched((mi.UInt32(len(ROUGHNESS) - 1),), _turned(turn, towards))[0] * share
             glossy = self._glossy(roughness, _turned(turn, dr.normalize(mirrored)))
-            hidden: Any = dr.power(cosine + share, dr.exp2(-16 * roughness - 1))
+            hidden = dr.power(cosine + share, dr.exp2(-16 * roughness - 1))
             glossy *= dr.clip(hidden - 1 + share, 0, 1)
             f0 = dr.lerp(mi.Color3f(SPECULAR), albedo, metallic)
             a, b = _split_sum(roughness, cosine)
@@ -245,10 +223,6 @@ class Studio:
 
     def _open(self, part: Any, uv: Any, valid: Any) -> Any:
         """Open sky (x, y, z, share) at a texture position, bilinear."""
-        import mitsuba
-
-        mi: Any = mitsuba  # its type stubs know one variant only
-
         size = self._sky_size
         columns = mi.UInt32(size)
         start = part * (size * size)
@@ -256,11 +230,6 @@ class Studio:
 
     def _fetched(self, levels: Sequence[Any], towards: Any) -> list[Any]:
         """The light of the maps numbered `levels` from a unit direction (studio axes)."""
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba  # its type stubs know one variant only
-
         down = dr.acos(dr.clip(towards.y, -1, 1)) * (dr.inv_pi * (ROWS - 1))
         right = dr.atan2(towards.x, -towards.z) * (dr.inv_two_pi * 2 * ROWS) + (2 * ROWS - 0.5)
         top, left = dr.minimum(dr.floor(down), ROWS - 2), dr.floor(right)
@@ -281,11 +250,6 @@ class Studio:
 
     def _glossy(self, roughness: Any, towards: Any) -> Any:
         """Prefiltered radiance, linear between the two nearest of ROUGHNESS."""
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba  # its type stubs know one variant only
-
         place = mi.Float(0)
         for low, high in pairwise(ROUGHNESS):
             place += dr.clip((roughness - low) / (high - low), 0, 1)
@@ -296,21 +260,12 @@ class Studio:
 
 def _turned(matrix: Sequence[Any], vector: Any) -> Any:
     """A 3 x 3 matrix, row by row, times a vector."""
-    import mitsuba
-
-    mi: Any = mitsuba  # its type stubs know one variant only
-
     rows = [matrix[3 * r] * vector.x + matrix[3 * r + 1] * vector.y + matrix[3 * r + 2] * vector.z for r in range(3)]
     return mi.Vector3f(*rows)
 
 
 def _material(look: tuple[Any, ...], part: Any, uv: Any, valid: Any) -> tuple[Any, Any, Any, Any]:
     """Albedo, tangent-space normal (not unit), roughness and metallic at a texture position, bilinear."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba  # its type stubs know one variant only
-
     texels, starts, rows, columns = look
     start, height, width = (dr.gather(mi.UInt32, a, part, valid) for a in (starts, rows, columns))
 
@@ -341,11 +296,6 @@ class _Page(NamedTuple):
 
 def _bilinear(kind: Any, table: Any, page: _Page, uv: Any, valid: Any, unpacked: Any = lambda row: row) -> Any:
     """The value of a page at uv in [0, 1), v down as in Mitsuba; pages repeat."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba  # its type stubs know one variant only
-
     start, height, width = page
     x, y = uv.x * mi.Float(width) - 0.5, uv.y * mi.Float(height) - 0.5
     left, top = dr.floor(x), dr.floor(y)
@@ -363,8 +313,6 @@ def _bilinear(kind: Any, table: Any, page: _Page, uv: Any, valid: Any, unpacked:
 
 def _split_sum(roughness: Any, cosine: Any) -> tuple[Any, Any]:
     """Factors A and B of F0 A + B: the share of a uniform environment that a GGX surface reflects."""
-    import drjit as dr
-
     x, y = 1 - roughness, dr.fma(roughness, -0.0275, 0.0425)
     z, w = dr.fma(roughness, -0.572, 1.04), dr.fma(roughness, 0.022, -0.04)
     share = dr.minimum(dr.square(x), dr.exp2(-9.28 * cosine)) * x + y

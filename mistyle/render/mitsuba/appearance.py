@@ -23,6 +23,7 @@ from mistyle.geometry.tangents import corner_tangents
 from mistyle.render.deferred import bsdf
 from mistyle.render.mitsuba import device, plugins
 from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.device import dr, mi
 
 PASSED = 32  # most surfaces that a path passes through
 LABELS = ("sampler", "ray", "active", "depth", "passed", "result", "throughput", "before", "pdf", "delta", "valid")
@@ -39,8 +40,6 @@ def is_plain(material: Material) -> bool:
 
 def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
     """A loaded Mitsuba mesh of one texture set whose material is not plain."""
-    import mitsuba as mi
-
     device.use()
     plugins.register()
     material = asset.materials[part]
@@ -77,16 +76,12 @@ def shapes(asset: Asset, maps: list[OwnMaps]) -> dict[str, Any]:
 
 def needs_path(shapes: dict[str, Any]) -> bool:
     """Whether a shape emits or transmits light, which Mitsuba's own integrators would not render correctly."""
-    import mitsuba as mi
-
     loaded = [s for s in shapes.values() if isinstance(s, mi.Shape)]
     return any(s.is_emitter() or mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in loaded)
 
 
 def integrator(depth: int) -> Any:
     """A `Path` of at most `depth` vertices, the light's included."""
-    import mitsuba as mi
-
     return classes(mi.variant())["Path"](depth)
 
 
@@ -152,22 +147,16 @@ def _opacity(material: Material, plugin_types: dict[str, type]) -> Any:
 
 
 def _loaded(values: Float[np.ndarray, "h w c"]) -> Any:
-    import mitsuba as mi
-
     return mi.load_dict(scenery.texture_dict(np.ascontiguousarray(values)))
 
 
 @cache
 def classes(variant: str) -> dict[str, type]:
     """The plugins as classes derived from the current variant's base classes."""
-    import mitsuba as mi
-
-    return {"Surface": _surface_class(mi), "Cut": _cut_class(mi), "Glow": _glow_class(mi), "Path": _path_class(mi)}
+    return {"Surface": _surface_class(), "Cut": _cut_class(), "Glow": _glow_class(), "Path": _path_class()}
 
 
-def _cut_class(mi: Any) -> type:
-    import drjit as dr
-
+def _cut_class() -> type:
     class Cut(mi.Texture):
         def __init__(self, nested, cutoff):
             super().__init__(mi.Properties())
@@ -191,9 +180,7 @@ def _cut_class(mi: Any) -> type:
     return Cut
 
 
-def _glow_class(mi: Any) -> type:
-    import drjit as dr
-
+def _glow_class() -> type:
     class Glow(mi.Emitter):
         def __init__(self, radiance, opacity):
             props = mi.Properties()
@@ -221,9 +208,7 @@ def _glow_class(mi: Any) -> type:
     return Glow
 
 
-def _path_class(mi: Any) -> type:
-    import drjit as dr
-
+def _path_class() -> type:
     class Path(mi.SamplingIntegrator):
         def __init__(self, depth):
             super().__init__(mi.Properties())
@@ -248,7 +233,7 @@ def _path_class(mi: Any) -> type:
                 return state[2]
 
             def step(*state):
-                return _next_surface(mi, scene, self.depth, state)
+                return _next_surface(scene, self.depth, state)
 
             state = dr.while_loop(state, going, step, labels=LABELS)
             return state[5], state[10], []
@@ -261,16 +246,12 @@ def _path_class(mi: Any) -> type:
 
 def _power_heuristic(a: Any, b: Any) -> Any:
     """Veach's power heuristic for a sample of density a that a strategy of density b could have generated."""
-    import drjit as dr
-
     total = dr.fma(a, a, b * b)
     return dr.select(total > 0, a * a / dr.select(total > 0, total, 1), 0)
 
 
-def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, ...]:
+def _next_surface(scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, ...]:
     """Extends a path of at most `most` vertices by one surface: its emission, its direct light, and the next ray."""
-    import drjit as dr
-
     sampler, ray, active, depth, passed, result, throughput, before, pdf, delta, valid = state
     ctx = mi.BSDFContext()
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
@@ -308,9 +289,7 @@ def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tup
     )
 
 
-def _surface_class(mi: Any) -> type:
-    import drjit as dr
-
+def _surface_class() -> type:
     class LayeredSurface(mi.BSDF):
         def __init__(self, textures, edge, coat, coat_roughness):
             super().__init__(mi.Properties())
@@ -323,23 +302,23 @@ def _surface_class(mi: Any) -> type:
             return self._eval(si, wo, active, self._values(si, active))
 
         def pdf(self, ctx, si, wo, active=True):
-            return _density(mi, self, si, wo, active, self._values(si, active))
+            return _density(self, si, wo, active, self._values(si, active))
 
         def eval_pdf(self, ctx, si, wo, active=True):
             values = self._values(si, active)
-            return self._eval(si, wo, active, values), _density(mi, self, si, wo, active, values)
+            return self._eval(si, wo, active, values), _density(self, si, wo, active, values)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             values = self._values(si, active)
-            shiny, coated, spread, coat = _strategy(mi, self, values)
+            shiny, coated, spread, coat = _strategy(self, values)
             above = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
             half, _ = spread.sample(above, sample2)
             outer, _ = coat.sample(above, sample2)
             glossy = sample1 < shiny + coated
             half = dr.select(sample1 < coated, outer, half)
             wo = dr.select(glossy, mi.reflect(si.wi, mi.Normal3f(half)), mi.warp.square_to_cosine_hemisphere(sample2))
-            sampled = plugins.reflected(mi, wo, glossy)
-            sampled.pdf = _density(mi, self, si, wo, active, values)
+            sampled = plugins.reflected(wo, glossy)
+            sampled.pdf = _density(self, si, wo, active, values)
             usable = active & (sampled.pdf > 0)
             value = self._eval(si, wo, active, values)
             return sampled, dr.select(usable, value / dr.select(usable, sampled.pdf, 1), 0)
@@ -368,10 +347,8 @@ def _surface_class(mi: Any) -> type:
     return LayeredSurface
 
 
-def _strategy(mi: Any, layers: Any, values: Any) -> tuple[Any, Any, Any, Any]:
+def _strategy(layers: Any, values: Any) -> tuple[Any, Any, Any, Any]:
     """The shares of samples from the visible normals of base and coat, and their distributions."""
-    import drjit as dr
-
     _, roughness, metallic, specular = values
     alpha = dr.maximum(dr.square(roughness), bsdf.ALPHA_FLOOR)
     shine = dr.clip(dr.maximum(metallic, dr.max(specular)), 0, 1)
@@ -383,11 +360,9 @@ def _strategy(mi: Any, layers: Any, values: Any) -> tuple[Any, Any, Any, Any]:
     return shine * (1 - coated), mi.Float(coated), spread, coat
 
 
-def _density(mi: Any, layers: Any, si: Any, wo: Any, active: Any, values: Any) -> Any:
+def _density(layers: Any, si: Any, wo: Any, active: Any, values: Any) -> Any:
     """The density of directions from a LayeredSurface's `sample`."""
-    import drjit as dr
-
-    shiny, coated, spread, coat = _strategy(mi, layers, values)
+    shiny, coated, spread, coat = _strategy(layers, values)
     above = active & (si.wi.z > 0) & (wo.z > 0)
     wi = dr.select(above, si.wi, mi.Vector3f(0, 0, 1))
     half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))

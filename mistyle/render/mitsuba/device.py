@@ -1,10 +1,16 @@
-"""Choice of the Mitsuba variant and its number of threads, at run time and never by an import."""
+"""Dr.Jit and Mitsuba as `dr` and `mi`, and the choice of variant and threads, at run time and never by an import.
+
+Every module of the renderer and the solver takes `dr` and `mi` from here. They are imported at their first use, so that
+importing such a module is quick and needs no LLVM.
+"""
 
 import gc
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 from mistyle.core.errors import EnvironmentMissing, InputRefused
@@ -23,6 +29,22 @@ LLVM_HELP = (
 )
 
 
+class _AtFirstUse(ModuleType):
+    """A module that is imported when something of it is used. Dr.Jit looks for LLVM when it is imported."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name != "module":
+            return getattr(self.module, name)
+        if "drjit" not in sys.modules:
+            use_llvm()
+        self.module = import_module(self.__name__)
+        return self.module
+
+
+dr: Any = _AtFirstUse("drjit")
+mi: Any = _AtFirstUse("mitsuba")  # of any variant: Mitsuba's own type stubs describe one
+
+
 def use(variant: str | None = None, threads: int | None = None) -> str:
     """Make a differentiable RGB variant of Mitsuba current and return its name.
 
@@ -30,12 +52,7 @@ def use(variant: str | None = None, threads: int | None = None) -> str:
     thread count (CPU only; None keeps it): results are bit-identical only at the same count. Repeated calls are cheap;
     every function of `render/` calls it. Raises EnvironmentMissing if no variant works.
     """
-    if "drjit" not in sys.modules:
-        use_llvm()
-    import drjit as dr
-    import mitsuba as mi
-
-    current = mi.variant()
+    current: str = mi.variant() or ""
     if variant is None:
         variant = current if current in VARIANTS else _first_working(mi.variants())
     elif variant not in VARIANTS:
@@ -54,8 +71,6 @@ def use(variant: str | None = None, threads: int | None = None) -> str:
 @contextmanager
 def file_threads() -> Iterator[None]:
     """At least two threads: with one, Mitsuba 3.9 deadlocks when it reads or writes an OpenEXR file."""
-    import drjit as dr
-
     before = dr.thread_count()
     if before < 2:
         dr.set_thread_count(2)
@@ -89,8 +104,6 @@ def plain_errors(doing: str) -> Iterator[None]:
 
 def give_back() -> None:
     """Release Dr.Jit's cached memory to the system."""
-    import drjit as dr
-
     dr.flush_malloc_cache()
 
 
@@ -103,8 +116,6 @@ class Frozen:
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        import drjit as dr
-
         self._run: Any = function if os.environ.get("MISTYLE_PLAIN") else dr.freeze(function)
 
     def __call__(self, *arguments: Any) -> Any:
@@ -130,8 +141,6 @@ def _first_working(built: list[str]) -> str:
 
 
 def _works(variant: str, built: list[str]) -> bool:
-    import drjit as dr
-
     backend = getattr(dr.JitBackend, VARIANTS[variant], None)
     if variant not in built or backend is None or not dr.has_backend(backend):
         return False
@@ -139,8 +148,6 @@ def _works(variant: str, built: list[str]) -> bool:
 
 
 def _missing(variant: str) -> str:
-    import drjit as dr
-
     if VARIANTS[variant] != "LLVM":
         return f"Mitsuba's {variant} does not work on this machine (no device or no driver). Use llvm_ad_rgb instead."
     if (ours := known_llvm()) and not os.environ.get("DRJIT_LIBLLVM_PATH"):

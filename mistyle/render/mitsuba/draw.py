@@ -18,6 +18,7 @@ from mistyle.core.view import View
 from mistyle.process import memory
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.scene import STUDIO, Staging
 from mistyle.render.mitsuba.texture_pages import paged_shapes
 
@@ -57,17 +58,12 @@ class Tracer:
 
 def tracer(mesh: Mesh) -> Tracer:
     """Build the ray tracing structure of a mesh (all texture sets in one shape)."""
-    import mitsuba as mi
-
     device.use()
     return Tracer(mesh, mi.load_dict({"type": "scene", "object": scenery.mitsuba_mesh(mesh, None)}))
 
 
 def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
     """One exact ray through each pixel centre of `camera`; a Tracer avoids rebuilding the structure."""
-    import drjit as dr
-    import mitsuba as mi
-
     device.use()
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
     height, width = camera.size
@@ -101,9 +97,6 @@ def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
 
 def misses(traced: Tracer, camera: Camera, px: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     """Whether the rays through pixel coordinates (x, y) miss the mesh."""
-    import drjit as dr
-    import mitsuba as mi
-
     origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.position))
     ray = mi.Ray3f(origin, mi.Vector3f(aligned(_directions(camera, px)[0].T)))
     return ~np.array(traced.scene.ray_test(ray)).astype(bool)
@@ -203,8 +196,6 @@ def pictures(
 
 def passes(mesh: Mesh, maps: Sequence[Maps], camera: Camera, staging: Staging) -> Iterator[Float[np.ndarray, "h w 4"]]:
     """An endless iterator of independent `picture`s; the scene is loaded once."""
-    import mitsuba as mi
-
     device.use()
     shapes = _shapes(mesh, maps, max(camera.size))
     described = scenery.scene_dict(mesh, maps, camera, staging, shapes)
@@ -227,8 +218,6 @@ def _shapes(mesh, maps, pixels):
 
 def _pictures(mesh, maps, cameras, staging):
     """Render camera after camera; the object is loaded once, a template that follows the camera for each."""
-    import mitsuba as mi
-
     device.use()
     shapes = _shapes(mesh, maps, max(max(c.size) for c in cameras))
 
@@ -250,8 +239,6 @@ def _pictures(mesh, maps, cameras, staging):
 
 def mean_of_passes(scene: Any, sensor: Any, size: tuple[int, int], spp: int, seed: int) -> Float[np.ndarray, "h w 4"]:
     """A picture of a loaded scene with at least `spp` samples a pixel, in passes of independent seeds."""
-    import mitsuba as mi
-
     times, each = scenery.passes(spp)
     total = np.zeros((*size, 4), np.float32)
     for k in range(times):

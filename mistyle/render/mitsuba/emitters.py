@@ -17,6 +17,7 @@ from mistyle.core.light import (
     direction_in_world,
     position_in_world,
 )
+from mistyle.render.mitsuba.device import mi
 
 ROWS = 256  # rows of the map that combines several soft lights
 
@@ -54,8 +55,5 @@ def _colour(values: Any) -> dict[str, Any]:
 
 
 def _map(radiance: np.ndarray, turn: float) -> dict[str, Any]:
-    import mitsuba
-
-    mi: Any = mitsuba
     bitmap = mi.Bitmap(np.ascontiguousarray(radiance, np.float32))
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], float(turn))}

@@ -1,35 +1,16 @@
 """Ambient occlusion and bent normals of surface points."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.mesh import Mesh
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer, tracer
 
 CHUNK = 1 << 18
 LIFT = 2e-3  # start of rays above the surface, in working units: exceeds the distance of facets from the smooth surface
-
-
-def ambient_occlusion(
-    mesh: Mesh | Tracer,
-    positions: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    *,
-    rays: int = 64,
-    distance: float = 1.2,
-    seed: int = 0,
-) -> Float[np.ndarray, " n"]:
-    """Share of unoccluded sky about unit `normals`, cosine-weighted (glTF's occlusion): 1 open, 0 closed.
-
-    Rays up to `distance` (working units) against all faces from both sides, stratified per point by a rank-1 lattice
-    that is shifted by a hash of the point's index and `seed`. A Tracer avoids rebuilding the structure. Hollows
-    narrower than 0.002 are missed.
-    """
-    return open_sky(mesh, positions, normals, rays=rays, distance=distance, seed=seed)[:, 3].copy()
 
 
 def open_sky(
@@ -41,12 +22,14 @@ def open_sky(
     distance: float = 1.2,
     seed: int = 0,
 ) -> Float[np.ndarray, "n 4"]:
-    """The mean direction of unoccluded sky (unit; the normal without any), and `ambient_occlusion`'s share."""
-    device.use()
-    import drjit as dr
-    import mitsuba
+    """The mean direction of unoccluded sky about unit `normals` (unit; the normal without any), and its share, 0..1,
+    cosine-weighted: glTF's occlusion.
 
-    mi: Any = mitsuba  # its type stubs know one variant only
+    Rays up to `distance` (working units) against all faces from both sides, stratified per point by a rank-1 lattice
+    that is shifted by a hash of the point's index and `seed`. A Tracer avoids rebuilding the structure. Hollows
+    narrower than 0.002 are missed.
+    """
+    device.use()
     scene = (mesh if isinstance(mesh, Tracer) else tracer(mesh)).scene
     out = np.empty((len(positions), 4), np.float32)
     golden = (5**0.5 - 1) / 2

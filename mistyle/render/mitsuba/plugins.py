@@ -22,6 +22,7 @@ from mistyle.core.mesh import Welded
 from mistyle.core.rows import corner_rows, distinct
 from mistyle.render.deferred import bsdf
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 
 GLTF, NORMALMAP = "mistyle_gltf", "mistyle_normalmap"
 TANGENT, HANDEDNESS = "vertex_tangent", "vertex_handedness"
@@ -31,12 +32,10 @@ _registered: set[str] = set()
 
 def register() -> None:
     """Register both plugins with Mitsuba's current variant (any; by default that of `device.use`)."""
-    import mitsuba as mi
-
     variant = mi.variant() or device.use()
     if variant not in _registered:
-        mi.register_bsdf(GLTF, _gltf_class(mi))
-        mi.register_bsdf(NORMALMAP, _normalmap_class(mi))
+        mi.register_bsdf(GLTF, _gltf_class())
+        mi.register_bsdf(NORMALMAP, _normalmap_class())
         _registered.add(variant)
 
 
@@ -55,9 +54,8 @@ def with_tangents(welded: Welded, tangents: Float[np.ndarray, "f 3 4"]) -> tuple
     return split, {TANGENT: attributes[:, :3], HANDEDNESS: np.sign(attributes[:, 3:])}
 
 
-def _gltf_class(mi: Any) -> type:
+def _gltf_class() -> type:
     """The BSDF as a class derived from `mi`'s current variant."""
-    import drjit as dr
 
     class Gltf(mi.BSDF):
         def __init__(self, props):
@@ -78,21 +76,21 @@ def _gltf_class(mi: Any) -> type:
             return self._eval(si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
 
         def pdf(self, ctx, si, wo, active=True):
-            return _density(mi, si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
+            return _density(si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
 
         def eval_pdf(self, ctx, si, wo, active=True):
             metallic, roughness = self.metallic.eval_1(si, active), self.roughness.eval_1(si, active)
             value = self._eval(si, wo, active, metallic, roughness)
-            return value, _density(mi, si, wo, active, metallic, roughness)
+            return value, _density(si, wo, active, metallic, roughness)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             metallic, roughness = self.metallic.eval_1(si, active), self.roughness.eval_1(si, active)
-            shiny, spread = _strategy(mi, metallic, roughness)
+            shiny, spread = _strategy(metallic, roughness)
             glossy = sample1 < shiny
             half, _ = spread.sample(mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z)), sample2)
             wo = dr.select(glossy, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
-            sampled = reflected(mi, dr.detach(wo), glossy)
-            sampled.pdf = _density(mi, si, sampled.wo, active, metallic, roughness)
+            sampled = reflected(dr.detach(wo), glossy)
+            sampled.pdf = _density(si, sampled.wo, active, metallic, roughness)
             value = self._eval(si, sampled.wo, active, metallic, roughness)
             usable = active & (sampled.pdf > 0)
             return sampled, dr.select(usable, value / dr.select(usable, sampled.pdf, 1), 0)
@@ -113,20 +111,16 @@ def _gltf_class(mi: Any) -> type:
     return Gltf
 
 
-def _strategy(mi: Any, metallic: Any, roughness: Any) -> tuple[Any, Any]:
+def _strategy(metallic: Any, roughness: Any) -> tuple[Any, Any]:
     """The share of samples that follow GGX's visible normals, and that distribution; the rest is cosine."""
-    import drjit as dr
-
     alpha = dr.maximum(dr.square(dr.detach(roughness)), bsdf.ALPHA_FLOOR)
     share = 0.5 + 0.5 * dr.clip(dr.detach(metallic), 0, 1)
     return share, mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, sample_visible=True)
 
 
-def _density(mi: Any, si: Any, wo: Any, active: Any, metallic: Any, roughness: Any) -> Any:
+def _density(si: Any, wo: Any, active: Any, metallic: Any, roughness: Any) -> Any:
     """The density of directions from `sample`."""
-    import drjit as dr
-
-    shiny, spread = _strategy(mi, metallic, roughness)
+    shiny, spread = _strategy(metallic, roughness)
     above = active & (si.wi.z > 0) & (wo.z > 0)
     half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))
     visible = spread.pdf(dr.select(above, si.wi, mi.Vector3f(0, 0, 1)), half)
@@ -134,10 +128,8 @@ def _density(mi: Any, si: Any, wo: Any, active: Any, metallic: Any, roughness: A
     return dr.select(above, dr.lerp(wo.z / dr.pi, lobe, shiny), 0)
 
 
-def reflected(mi: Any, wo: Any, glossy: Any) -> Any:
+def reflected(wo: Any, glossy: Any) -> Any:
     """A sample of reflection towards `wo`, of the glossy component or the diffuse one; its density is not set."""
-    import drjit as dr
-
     sampled = dr.zeros(mi.BSDFSample3f)
     sampled.wo = wo
     sampled.eta = mi.Float(1)
@@ -147,9 +139,8 @@ def reflected(mi: Any, wo: Any, glossy: Any) -> Any:
     return sampled
 
 
-def _normalmap_class(mi: Any) -> type:
+def _normalmap_class() -> type:
     """The BSDF as a class derived from `mi`'s current variant."""
-    import drjit as dr
 
     class NormalMap(mi.BSDF):
         def __init__(self, props):
@@ -168,26 +159,26 @@ def _normalmap_class(mi: Any) -> type:
             cb.put("normalmap", self.normalmap, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 
         def eval(self, ctx, si, wo, active=True):
-            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            tilted, frame = _tilted(self.normalmap, self.flip, si, active)
             inner = frame.to_local(wo)
             active = active & (wo.z * inner.z > 0)
             return dr.select(active, self.nested.eval(ctx, tilted, inner, active), 0)
 
         def pdf(self, ctx, si, wo, active=True):
-            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            tilted, frame = _tilted(self.normalmap, self.flip, si, active)
             inner = frame.to_local(wo)
             active = active & (wo.z * inner.z > 0)
             return dr.select(active, self.nested.pdf(ctx, tilted, inner, active), 0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
-            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            tilted, frame = _tilted(self.normalmap, self.flip, si, active)
             inner = frame.to_local(wo)
             active = active & (wo.z * inner.z > 0)
             value, pdf = self.nested.eval_pdf(ctx, tilted, inner, active)
             return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            tilted, frame = _tilted(self.normalmap, self.flip, si, active)
             sampled, weight = self.nested.sample(ctx, tilted, sample1, sample2, active)
             outer = frame.to_world(sampled.wo)
             active = active & (sampled.wo.z * outer.z > 0)
@@ -196,7 +187,7 @@ def _normalmap_class(mi: Any) -> type:
             return sampled, dr.select(active, weight, 0)
 
         def sh_frame(self, si, active=True):
-            return _tilted(mi, self.normalmap, self.flip, si, active)[0].sh_frame
+            return _tilted(self.normalmap, self.flip, si, active)[0].sh_frame
 
         def eval_diffuse_reflectance(self, si, active=True):
             return self.nested.eval_diffuse_reflectance(si, active)
@@ -207,11 +198,9 @@ def _normalmap_class(mi: Any) -> type:
     return NormalMap
 
 
-def _tilted(mi: Any, normalmap: Any, flip: bool, si: Any, active: Any) -> tuple[Any, Any]:
+def _tilted(normalmap: Any, flip: bool, si: Any, active: Any) -> tuple[Any, Any]:
     """The interaction in the bumped frame, and that frame relative to `si.sh_frame`."""
-    import drjit as dr
-
-    s, t = _tangents(mi, si, active)
+    s, t = _tangents(si, active)
     encoded = normalmap.eval_3(si, active)
     x, y, z = 2 * encoded.x - 1, 2 * encoded.y - 1, 2 * encoded.z - 1
     x, y = x * s.x + y * t.x, x * s.y + y * t.y
@@ -230,10 +219,8 @@ def _tilted(mi: Any, normalmap: Any, flip: bool, si: Any, active: Any) -> tuple[
     return tilted, frame
 
 
-def _tangents(mi: Any, si: Any, active: Any) -> tuple[Any, Any]:
+def _tangents(si: Any, active: Any) -> tuple[Any, Any]:
     """The normal map's two axes in the tangent plane of `si.sh_frame`, 2D."""
-    import drjit as dr
-
     # No `&=` here: Dr.Jit would change the caller's mask.
     valid = active
     if dr.is_jit_v(mi.Float):

@@ -9,8 +9,10 @@ from jaxtyping import Float
 from mistyle.core.camera import Camera
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.geometry.next_best_view import candidate_cameras, choose
+from mistyle.render.mitsuba.draw import tracer
+from mistyle.render.mitsuba.visible import face_on
 
 SAMPLES = 20_000
 
@@ -57,9 +59,6 @@ def next_best_views(mesh: Mesh, settings: RigSettings, traced: Any = None) -> Pl
     sampled at SAMPLES points of equal area, so features smaller than a few of them may be missed. Raises InputRefused
     if no candidate sees the mesh.
     """
-    from mistyle.render.mitsuba.draw import tracer
-    from mistyle.render.mitsuba.visible import face_on
-
     points = sample_surface(mesh, SAMPLES)
     cameras = candidate_cameras(settings)
     weight = face_on(traced or tracer(mesh), cameras, points.positions, points.normals, points.fronts)

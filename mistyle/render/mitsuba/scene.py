@@ -33,6 +33,7 @@ from mistyle.core.paths import scenes
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
 from mistyle.render.mitsuba import device, plugins
+from mistyle.render.mitsuba.device import dr, mi
 
 TEMPLATES = ("paper_views", "phase1_directional", "phase2_ambient", "studio", "hdri")
 
@@ -70,9 +71,6 @@ def mitsuba_mesh(
     v is flipped only here: Mitsuba's texture row 0 is v = 0, ours is v = 1. `bsdf` and `emitter` are loaded. `tangents`
     (of all the mesh's faces, from `mikktspace`) become the attributes that `mistyle_normalmap` reads.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     device.use()
     welded = weld(mesh, part)
     attributes: dict[str, Any] = {}
@@ -96,8 +94,7 @@ def mitsuba_mesh(
     values["faces"] = mi.UInt32(aligned(welded.faces.ravel(), np.uint32))
     values.update()
     for key, data in attributes.items():
-        flat: Any = aligned(data.ravel())
-        shape.add_attribute(key, data.shape[1], flat)
+        shape.add_attribute(key, data.shape[1], aligned(data.ravel()))
     dr.eval(values["vertex_positions"], values["vertex_normals"], values["vertex_texcoords"])
     return shape
 
@@ -107,8 +104,6 @@ def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
 
     It repeats, since `Mesh.corner_uvs` are modulo 1: an island may cross the border of the unit square.
     """
-    import mitsuba as mi
-
     data = mi.TensorXf(whole(values))
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
@@ -168,8 +163,6 @@ def object_shapes(
 
     `frame` "mikkt" shades normal maps in MikkTSpace frames, as glTF viewers do.
     """
-    import mitsuba as mi
-
     device.use()
     chosen = list(maps) if maps is not None else [flat_maps(2, NEUTRAL_GREY)] * len(mesh.parts)
     if len(chosen) != len(mesh.parts):
@@ -189,8 +182,6 @@ def object_shapes(
 
 def object_shape(mesh: Mesh, part: int, maps: Maps, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
     """One texture set of `object_shapes` with glTF's model in MikkTSpace frames, for pictures."""
-    import mitsuba as mi
-
     bsdf = mi.load_dict(bsdf_dict(maps, True, model="gltf", frame="mikkt"))
     return mitsuba_mesh(mesh, part, bsdf, f"part{part}", tangents=tangents)
 
@@ -221,8 +212,6 @@ def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
     Correlated multi-jittered samples: the error of views at 16 per pixel is that of 44 independent samples. Render with
     `samples(spp)`.
     """
-    import mitsuba as mi
-
     height, width = camera.size
     return {
         "type": "perspective",
@@ -268,8 +257,6 @@ def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | 
     The file itself is trusted: Mitsuba opens all files that it names. `hdri` is linear radiance, latitude-longitude, +Y
     up. Raises InputRefused if the file is not a readable scene, has no shape "object", or does not accept an `hdri`.
     """
-    import mitsuba as mi
-
     device.use()
     path = template_path(template)
     declared = set(re.findall(r'<default\s+name="(\w+)"', path.read_text(encoding="utf-8", errors="replace")))
@@ -326,8 +313,6 @@ def scene_dict(
     ignored, except for the floor's height. Emitters with ids "camera_…" are placed for `camera` (without one they keep
     the file's transform).
     """
-    import mitsuba as mi
-
     device.use()
     floor = float(mesh.positions[:, 1].min()) if len(mesh.positions) else -1.0
     heading = _heading(camera) if camera is not None else 0.0
@@ -355,8 +340,6 @@ def scene_dict(
 
 def camera_emitters(emitters: dict[str, Any], sensor: Any, camera: Camera) -> dict[str, Any]:
     """Transforms of the emitters "camera_…" for `camera`: moved rigidly from the file's sensor."""
-    import mitsuba as mi
-
     result: dict[str, Any] = {}
     if sensor is None:
         return result
@@ -369,10 +352,7 @@ def camera_emitters(emitters: dict[str, Any], sensor: Any, camera: Camera) -> di
 
 
 def _matrix(plugin: Any) -> Float[np.ndarray, "4 4"]:
-    import mitsuba as mi
-
-    transform: Any = mi.traverse(plugin)["to_world"]
-    return np.asarray(transform.matrix, dtype=np.float64).reshape(4, 4)
+    return np.asarray(mi.traverse(plugin)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
 
 
 def _heading(camera: Camera) -> float:

@@ -18,21 +18,20 @@ from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
 from mistyle.render.mitsuba import device, plugins
 from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.device import dr, mi
 
 PAGE = "face_page"  # face attribute with the page number
 
 
 def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -> dict[str, Any]:
     """The mesh with all its texture sets as one loaded shape, normal maps in MikkTSpace frames; for pictures only."""
-    import mitsuba as mi
-
     device.use()
     if len(maps) != len(mesh.parts):
         raise ValueError(
             f"{len(maps)} maps for {len(mesh.parts)} texture sets; expected one for each ({', '.join(mesh.parts)})"
         )
     plugins.register()
-    pages = _pages_class(mi)
+    pages = _pages_class()
     textures = {name: _texture(pages, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}
     bsdf = {
         "type": "principled",
@@ -65,8 +64,6 @@ def _texture(
     fill: Callable[[np.ndarray, np.ndarray], object] = lambda to, values: np.copyto(to, values),
 ) -> Any:
     """The texture of one kind of map; `fill(to, values)` writes the values in texture encoding."""
-    import mitsuba as mi
-
     start, sizes = table(values)
     channels = 1 if values[0].ndim == 2 else values[0].shape[2]
     count = int(sizes.prod(axis=1).sum()) * channels
@@ -78,9 +75,8 @@ def _texture(
     return pages(mi.Float(texels), *(mi.UInt32(aligned(n, np.uint32)) for n in (start, *sizes.T)), channels)
 
 
-def _pages_class(mi: Any) -> type:
+def _pages_class() -> type:
     """The texture as a class derived from `mi`'s current variant."""
-    import drjit as dr
 
     class Pages(mi.Texture):
         """Bilinear lookups in the page of the hit face; pages repeat."""
@@ -92,8 +88,7 @@ def _pages_class(mi: Any) -> type:
         def eval(self, si, active=True):
             return mi.Color3f(self._lookup(si, active))
 
-        def eval_3(self, si, active=True):
-            return mi.Color3f(self._lookup(si, active))
+        eval_3 = eval
 
         def eval_1(self, si, active=True):
             return self._lookup(si, active)

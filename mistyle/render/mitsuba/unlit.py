@@ -13,6 +13,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.process import memory
 from mistyle.render.deferred.image_samples import window
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer, tracer
 
 FINE = 3  # rays along each side of a pixel
@@ -31,10 +32,6 @@ def unlit(
     Each ray takes the albedo of the texture set at its first hit, bilinear, UVs modulo 1.
     """
     device.use()
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
     starts = np.cumsum([0, *(chosen.roughness.size for chosen in maps)])
     flat = [np.ascontiguousarray(chosen.albedo, np.float32).reshape(-1) for chosen in maps]
@@ -66,13 +63,13 @@ def unlit(
 
     pictures = []
     for camera in cameras:
-        rgb, share = _picture(mi, dr, traced, camera, fine, fetch)
+        rgb, share = _picture(traced, camera, fine, fetch)
         pictures.append((memory.copied(rgb), memory.copied(share)) if memory.tight() else (rgb, share))
         progress(len(pictures) / len(cameras))
     return pictures
 
 
-def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch: Callable[[Any], Any]) -> Picture:
+def _picture(traced: Tracer, camera: Camera, fine: int, fetch: Callable[[Any], Any]) -> Picture:
     down, across = window(traced.mesh, camera)
     height, width = down.stop - down.start, across.stop - across.start
     rgb, share = np.zeros((*camera.size, 3), np.float32), np.zeros(camera.size, np.float32)

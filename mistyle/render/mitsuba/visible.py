@@ -1,7 +1,6 @@
 """Exact visibility and facing weight of surface points from cameras, by rays to the cameras."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -9,6 +8,7 @@ from jaxtyping import Float
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer
 
 LIFT = 1e-3  # start of rays above the surface, working units
@@ -29,10 +29,6 @@ def face_on(
     camera. `normals` are the shading normals n, `fronts` the unit normals of the faces on their outer side. World
     space.
     """
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     device.use()
     eyes = mi.Float(aligned(np.stack([c.position for c in cameras]).ravel()))
     points, shading, outer = (mi.Float(aligned(np.ascontiguousarray(a).ravel())) for a in (positions, normals, fronts))

@@ -22,13 +22,14 @@ pictures are slow to render.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, MaterialTable
+from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.solver.context import DirectCaptures, FitContext
 from mistyle.solver.joint.algebra import LinearisedImage, Unknowns, diagonal_blocks, normal_matvec, pcg, rhs
 from mistyle.solver.joint.pixels import (
@@ -47,9 +48,6 @@ from mistyle.solver.smoothing import LEAST, prior_precision_matrix
 from mistyle.solver.table import Atlas, with_seam_weights
 from mistyle.solver.texels.observations import observation_std
 from mistyle.solver.texels.solve import estimate_indirect
-
-if TYPE_CHECKING:
-    from mistyle.render.deferred.renderer import MaterialRenderer
 
 # Scale of the residuals' standard deviation relative to `noise` and `relative`: LOOSE times the median's estimate,
 # since there are about as many unknowns as pixels and most pixels overfit; FIT at least.
@@ -85,7 +83,7 @@ class JointProblem:
     """
 
     context: FitContext
-    renderer: "MaterialRenderer"
+    renderer: MaterialRenderer
     footprints: Sequence[ImageFootprint]
     unknown: UnknownTexels
     direct: DirectCaptures
@@ -116,13 +114,13 @@ class JointProblem:
 class JointSetup:
     """Geometry that all joint passes share: see `JointProblem`; `axes` are the unknown texels' frames."""
 
-    renderer: "MaterialRenderer"
+    renderer: MaterialRenderer
     footprints: Sequence[ImageFootprint]
     unknown: UnknownTexels
     axes: Float[np.ndarray, "t 9"]
 
 
-def joint_setup(context: FitContext, renderer: "MaterialRenderer") -> JointSetup | None:
+def joint_setup(context: FitContext, renderer: MaterialRenderer) -> JointSetup | None:
     """The footprints; None, with a note, where they exceed the memory.
 
     `renderer` holds no samples; they get the part of `settings.memory` that the steps' arrays leave.

@@ -9,7 +9,7 @@ change of a metal's reflection with its tilt, are treated as constant.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,14 +19,12 @@ from mistyle.core.camera import Camera, by_camera
 from mistyle.core.light import Point
 from mistyle.render.deferred.image_samples import SampleBlock, Sampling, TexturedMesh, bilinear_taps, collect
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, TILT
+from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.solver.context import FitContext
 from mistyle.solver.indirect import PALE, enlarged
 from mistyle.solver.schedule import JOINT_PIXEL, joint_bytes
 from mistyle.solver.table import fill
 from mistyle.solver.texels.observations import covered_rows, points_of
-
-if TYPE_CHECKING:
-    from mistyle.render.deferred.renderer import MaterialRenderer
 
 WEIGHT = 8  # bytes of a bilinear weight
 LEAST_Z = 0.2  # least z of a mapped normal
@@ -54,7 +52,7 @@ class UnknownTexels:
 
 
 def image_footprints(
-    context: FitContext, renderer: "MaterialRenderer"
+    context: FitContext, renderer: MaterialRenderer
 ) -> tuple[list[ImageFootprint], UnknownTexels, float] | None:
     """All pictures' lit pixels and, if indirect light is estimated, the other pixels of the mesh; the unknown texels;
     and the bytes of memory that remain. None if the memory does not suffice."""
@@ -81,12 +79,12 @@ def image_footprints(
     return result, UnknownTexels(rows, seen[rows]), left
 
 
-def _lit_pixels(renderer: "MaterialRenderer", picture: int) -> ImageFootprint:
+def _lit_pixels(renderer: MaterialRenderer, picture: int) -> ImageFootprint:
     """Pixels that a light reaches."""
     return _footprint((block.hits for block in renderer.blocks(picture)), renderer.sizes, renderer.subsamples)
 
 
-def _covered_pixels(context: FitContext, renderer: "MaterialRenderer", camera: Camera) -> ImageFootprint:
+def _covered_pixels(context: FitContext, renderer: MaterialRenderer, camera: Camera) -> ImageFootprint:
     """Pixels of the mesh, rendered with a flash at the camera, which casts no visible shadow."""
     surface = TexturedMesh(context.traced, renderer.sizes, context.tangents)
     sampling = Sampling(renderer.subsamples, shadows=False, gradients=False)

@@ -14,12 +14,11 @@ from mistyle.solver.photometry.material import (
     MatchedMaterial,
     MaterialSamples,
     fixed_gains,
-    problem_of,
     solve_with_material,
 )
 from mistyle.solver.photometry.record import Gains, Photometry, with_gains, without_gains
 from mistyle.solver.photometry.solve import AGREE, LOWER
-from mistyle.solver.texels.levenberg_marquardt import Options
+from mistyle.solver.texels.levenberg_marquardt import Options, Problem
 
 FIXED = 0.1  # of the time: the texels at given gains
 EXPLAINED = 0.05  # difference up to which a material without a veil shows that the veil was gloss
@@ -46,7 +45,8 @@ def explained(
     by AGREE and to LOWER of that as photographed: errors of the model (indirect light) pass for gains of some percent
     and lower it by up to 0.008. A veil of `found` stays unless a material explains the pictures without.
     """
-    problem, n = problem_of(samples, replace(options, metallic=True)), samples.pictures
+    n, options = samples.pictures, replace(options, metallic=True)
+    problem = Problem(samples.points, samples.rig, samples.observations, options)
     none = Gains(np.zeros((n, 3)), np.zeros(3))
     plain = fixed_gains(samples, problem, none)
     progress(FIXED)

@@ -35,7 +35,7 @@ from mistyle.solver.photometry.solve import positions
 from mistyle.solver.prior import log_prior_penalty, metal_f0_prior, penalty
 from mistyle.solver.table import Atlas, linked
 from mistyle.solver.texels.gbuffer import open_sky, rig
-from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Points, Problem, Rig, Solution
+from mistyle.solver.texels.levenberg_marquardt import Observations, Points, Problem, Rig, Solution
 from mistyle.solver.texels.observations import (
     ObservationOptions,
     TexelObservations,
@@ -135,11 +135,6 @@ def all_samples(observed: TexelObservations, cameras: Sequence[Camera], noise: t
     worth = seen.weight * observation_std(np.maximum(seen.rgb.max(axis=1, initial=0), 0), *noise)
     x = positions(observed, cameras)
     return MaterialSamples(observed.points, observed.rig, seen, x, worth.astype(np.float32), noise)
-
-
-def problem_of(samples: MaterialSamples, options: Options) -> Problem:
-    """The per-texel solver of the samples."""
-    return Problem(samples.points, samples.rig, samples.observations, options)
 
 
 def log_gain(samples: MaterialSamples, gains: Gains) -> Float[np.ndarray, "o 3"]:

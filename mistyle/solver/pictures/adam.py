@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT_X, TILT_Y
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 
 CHANNELS = ("albedo", "albedo", "albedo", "normal", "normal", "roughness", "metallic")
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12
@@ -49,7 +50,7 @@ class Descent:
     """Moments of every level of every texture set's pyramid, and the step.
 
     `rates` are factors of the rate per channel of the table (8; 0 freezes a channel), `shares` further factors by texel
-    and channel; `still` marks frozen texels.
+    and channel.
     """
 
     def __init__(
@@ -58,13 +59,9 @@ class Descent:
         rates: Sequence[float],
         options: AdamOptions = DEFAULT_OPTIONS,
         *,
-        still: Bool[np.ndarray, " t"] | None = None,
         shares: Float[np.ndarray, "t 8"] | None = None,
     ) -> None:
         device.use()
-        import mitsuba
-
-        mi: Any = mitsuba
         self.sizes = [(rows, columns) for rows, columns in sizes]
         self.rates, self.options = tuple(rates), options
         self.texels = sum(rows * columns for rows, columns in sizes)
@@ -72,19 +69,12 @@ class Descent:
         widths = [rows * columns for pyramid in self.pyramids for rows, columns in pyramid]
         self.moments = [[mi.Float(aligned(np.zeros(8 * n))) for n in widths] for _ in range(2)]
         self.ages = [mi.Float(aligned(np.zeros(n))) for n in widths]
-        free = np.full(self.texels, FINE, np.uint32)
-        if still is not None:
-            free[still] = FINE - 1
-        self.blame = mi.UInt32(aligned(free, np.uint32))
+        self.blame = mi.UInt32(aligned(np.full(self.texels, FINE), np.uint32))
         self.shares = [] if shares is None else [mi.Float(aligned(shares.ravel()))]
         self._run = device.Frozen(self._step)
 
     def step(self, table: Any, gradient: Any, rate: float, picture: int) -> Any:
         """The table (a Dr.Jit Float, 8 a texel) after one step along `gradient` (same layout) of `picture`."""
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba
         table, self.moments, self.ages, self.blame = self._run(
             table, gradient, (self.moments, self.ages, self.blame), self.shares,
             dr.opaque(mi.Float, float(rate)), dr.opaque(mi.UInt32, COLUMNS * picture),
@@ -101,9 +91,6 @@ class Descent:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Resume from `state()`."""
-        import mitsuba
-
-        mi: Any = mitsuba
         count = len(self.ages)
         self.moments = [[mi.Float(aligned(state[f"{n}{k}"])) for k in range(count)] for n in ("first", "second")]
         self.ages = [mi.Float(aligned(state[f"age{k}"])) for k in range(count)]
@@ -112,15 +99,11 @@ class Descent:
     def stopped(self) -> list[tuple[int, str, int]]:
         """(texel, map, picture) of every texel whose gradient was not finite."""
         blame: Int[np.ndarray, " t"] = np.array(self.blame)
-        bad = np.flatnonzero(blame < FINE - 1)
+        bad = np.flatnonzero(blame < FINE)
         return [(int(k), CHANNELS[int(blame[k]) % 8], int(blame[k]) // 8) for k in bad]
 
     def _step(self, table, gradient, state, shares, rate, picture) -> Any:
         """New table, moments, ages and records of non-finite gradients; `state` holds the old ones."""
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba
         moments, ages, blame = state
         texel = dr.arange(mi.UInt32, self.texels)
         rows = [dr.gather(mi.Float, gradient, texel * COLUMNS + c) for c in range(7)]
@@ -163,10 +146,6 @@ class Descent:
 
     def _adam(self, g, first, second, age) -> tuple[Any, Any, Any, Any]:
         """Moments and step of one level; 0 where the gradient is 0."""
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba
         width = dr.width(age)
         row = dr.arange(mi.UInt32, width)
         old1, old2 = (dr.gather(mi.ArrayXf, a, row, shape=(8, width)) for a in (first, second))
@@ -187,8 +166,6 @@ class Descent:
         return dr.ravel(dr.select(on, new1, old1)), dr.ravel(dr.select(on, new2, old2)), age, step
 
     def _projected(self, x: list) -> list:
-        import drjit as dr
-
         scale = dr.minimum(
             1, self.options.tilt / dr.maximum(dr.sqrt(dr.square(x[TILT_X]) + dr.square(x[TILT_Y])), 1e-9)
         )
@@ -206,10 +183,6 @@ def _levels(size: tuple[int, int], levels: int) -> list[tuple[int, int]]:
 
 def _halved(packed: Any, start: int, size: tuple[int, int], half: tuple[int, int]) -> Any:
     """Sums over 2 x 2 texels of the `size` ones from `start` on."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     count = half[0] * half[1]
     index = dr.arange(mi.UInt32, count)
     row, column = index // half[1], index % half[1]
@@ -224,10 +197,6 @@ def _halved(packed: Any, start: int, size: tuple[int, int], half: tuple[int, int
 
 def _upsample(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any:
     """Bilinear interpolation of a level's texels at those of the texture."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     packed, count = dr.ravel(coarse), size[0] * size[1]
     index = dr.arange(mi.UInt32, count)
     by = 2 ** round(np.log2(size[0] / shape[0]))
@@ -244,7 +213,4 @@ def _upsample(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any
 
 def table_on_device(table: Float[np.ndarray, "t 8"]) -> Any:
     """The table as a Dr.Jit array in memory aligned to 64 bytes."""
-    import mitsuba
-
-    mi: Any = mitsuba
     return mi.Float(aligned(table.ravel()))

@@ -7,7 +7,7 @@ corrects them by the pictures.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,19 +16,17 @@ from mistyle.core.maps import place_of
 from mistyle.core.rows import evenly
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import COLUMNS, SOLVED, TILT, MaterialTable
+from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.solver.context import FitContext
 from mistyle.solver.journal import Journal
 from mistyle.solver.pass_state import PassState
+from mistyle.solver.pictures.adam import AdamOptions, Descent, table_on_device
 from mistyle.solver.prior import NOTHING
 from mistyle.solver.schedule import JUDGES, Pass
 from mistyle.solver.settings import RecoverSettings, passes
 from mistyle.solver.smoothing import map_smoothing
 from mistyle.solver.table import Atlas, fill
 from mistyle.solver.texels.solve import TexelEstimate, journalled_light
-
-if TYPE_CHECKING:
-    from mistyle.render.deferred.renderer import MaterialRenderer
-    from mistyle.solver.pictures.adam import Descent
 
 SEEDS = 7907  # seed offset between two estimates; exceeds the number of rounds
 # Factors of the rate by channel after the per-texel solver: albedo is nearly right already, and longer steps would
@@ -47,7 +45,7 @@ DAMPING = 0.3
 
 def picture_pass(
     context: FitContext,
-    renderer: "MaterialRenderer",
+    renderer: MaterialRenderer,
     state: PassState,
     one: Pass,
     journal: Journal,
@@ -68,7 +66,7 @@ def picture_pass(
     return replace(state, table=table, direct=direct)
 
 
-def settled(context: FitContext, renderer: "MaterialRenderer", state: PassState) -> PassState:
+def settled(context: FitContext, renderer: MaterialRenderer, state: PassState) -> PassState:
     """The state after the last pass on whole pictures, smoothed; the texels' estimate, with a note, if the loss did not
     fall."""
     estimate = state.estimate
@@ -101,15 +99,13 @@ def _number(context: FitContext, one: Pass) -> int:
 
 def _descend(
     context: FitContext,
-    renderer: "MaterialRenderer",
+    renderer: MaterialRenderer,
     estimate: TexelEstimate,
     run: tuple[MaterialTable, Pass],
     progress: Callable[[float], None],
     journal: Journal,
 ) -> MaterialTable:
     """The steps of a pass from the table of `run`; the rate falls to zero along a cosine."""
-    from mistyle.solver.pictures.adam import table_on_device
-
     settings, count, (base, one), resume = context.settings, len(context.captures), run, journal.recall("adam")
     descent = _descent(context, estimate)
     table, first, pending, own = table_on_device(base), one.begin, [], []
@@ -143,8 +139,7 @@ def _descend(
     return np.array(table).reshape(-1, COLUMNS)
 
 
-def _descent(context: FitContext, estimate: TexelEstimate) -> "Descent":
-    from mistyle.solver.pictures.adam import AdamOptions, Descent
+def _descent(context: FitContext, estimate: TexelEstimate) -> Descent:
 
     settings, solved = context.settings, estimate.solved
     rates = [1.0, 1, 1, 1, 1, 1, 1 if settings.metallic else 0, 0]
@@ -155,7 +150,7 @@ def _descent(context: FitContext, estimate: TexelEstimate) -> "Descent":
     )
 
 
-def _state(descent: "Descent", table: Any, step: int, losses: list[float]) -> dict[str, np.ndarray]:
+def _state(descent: Descent, table: Any, step: int, losses: list[float]) -> dict[str, np.ndarray]:
     """The arrays from which a later run resumes at `step`."""
     own = {"iteration": np.array(step), "losses": np.array(losses)}
     return descent.state() | own | {"table": np.array(table).reshape(-1, COLUMNS)}
@@ -202,7 +197,7 @@ def _note_stopped(context: FitContext, stopped: list[tuple[int, str, int]]) -> N
         context.notes.append(f"{len(stopped) - 3} more texels had such gradients.")
 
 
-def total_loss(renderer: "MaterialRenderer", table: MaterialTable, settings: RecoverSettings) -> float:
+def total_loss(renderer: MaterialRenderer, table: MaterialTable, settings: RecoverSettings) -> float:
     """Mean loss over the pictures, or over JUDGES of them, evenly spaced."""
     uploaded, chosen = renderer.upload(table), evenly(len(renderer.captures), JUDGES)
     return float(np.mean([np.array(renderer.step(uploaded, [k], settings.loss)[0])[0] for k in chosen]))

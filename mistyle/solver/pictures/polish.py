@@ -21,6 +21,7 @@ from mistyle.render.deferred import pyramid as laplacian
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.emitters import emitters
 from mistyle.solver.scene import gradients as scene_grad
 
@@ -109,13 +110,10 @@ class _Job:
     """The object with its textures, which all scenes share, and one lazily built scene per picture."""
 
     def __init__(self, mesh: Mesh, maps: Sequence[Maps], captures: Captures, settings: PolishSettings) -> None:
-        import mitsuba
-
-        self.mi: Any = mitsuba
         self.start, self.captures, self.loss = tuple(maps), captures, scene_grad.LOSSES[settings.loss]
         self.shapes = scenery.object_shapes(mesh, maps, model=settings.model, frame=settings.frame)
         engine = {"type": "prb", "max_depth": settings.depth, "rr_depth": settings.depth + 1, "hide_emitters": True}
-        self.engine = self.mi.load_dict(engine)
+        self.engine = mi.load_dict(engine)
         self._environments: dict[tuple[int, ...], list[Any]] = {}
         moving = [n for n in RATES if n != "metallic" or settings.metallic]
         parts = [p for p in range(len(maps)) if f"part{p}" in self.shapes]
@@ -134,7 +132,7 @@ class _Job:
         camera = self.captures.cameras[k]
         described = {"type": "scene", "sensor": scenery.sensor_dict(camera, 16), **self.shapes}
         described |= {f"light{j}": light for j, light in enumerate(self._lights(k))}
-        return self.mi.load_dict(described, optimize=False)
+        return mi.load_dict(described, optimize=False)
 
     def _lights(self, k: int) -> list[Any]:
         """The lights of picture k. Environment maps are cached; other lights may depend on the camera and load fast."""
@@ -144,7 +142,7 @@ class _Job:
             return self._environments[key]
         emitter_dicts = emitters(lights, camera)
         if all(light["type"] == "envmap" for light in emitter_dicts):
-            emitter_dicts = self._environments[key] = [self.mi.load_dict(light) for light in emitter_dicts]
+            emitter_dicts = self._environments[key] = [mi.load_dict(light) for light in emitter_dicts]
         return emitter_dicts
 
     def values(self) -> dict[str, np.ndarray]:
@@ -175,23 +173,19 @@ class _Job:
         rgb, mask = self.captures.load(k)
         counts = mask & (np.array(shown)[..., 3] > SOLID)
         clean = np.ascontiguousarray(np.where(counts[..., None], rgb, 0), np.float32)
-        wide = self.mi.TensorXb(aligned(np.broadcast_to(counts[..., None], clean.shape), bool))
+        wide = mi.TensorXb(aligned(np.broadcast_to(counts[..., None], clean.shape), bool))
         share = max(float(counts.mean()), 1e-9)
         # These weights belong to the relative loss, which this stage does not support.
-        return shown, scene_grad.ReferenceView(sensor, self.mi.TensorXf(aligned(clean)), wide, None, share)
+        return shown, scene_grad.ReferenceView(sensor, mi.TensorXf(aligned(clean)), wide, None, share)
 
     def gradient(self, values, k: int, spp: tuple[int, int], seeds: tuple[int, int]):
         """Loss of picture k and its gradient by key."""
-        import drjit as dr
-
         scene = self.scene(k)
         table = self._table(scene)
         moving = scene_grad.put(table, self.chosen, values, grad=True)
         shown, view = self._render_pair(scene, k, spp[0], seeds[0])
         value, pixels, _ = scene_grad.compare(shown, view, self.loss)
-        self.engine.render_backward(
-            scene, table, pixels, view.sensor, seed=dr.opaque(self.mi.UInt32, seeds[1]), spp=spp[1]
-        )
+        self.engine.render_backward(scene, table, pixels, view.sensor, seed=dr.opaque(mi.UInt32, seeds[1]), spp=spp[1])
         return value, {p.key: scene_grad.array(dr.grad(moving[p.key]), p) for p in self.chosen}
 
     def judge(self, values, pictures: Sequence[int], spp: int, seed: int) -> float:
@@ -207,6 +201,6 @@ class _Job:
         return float(np.mean([one(k) for k in pictures]))
 
     def _table(self, scene: Any) -> Any:
-        table = self.mi.traverse(scene)
+        table = mi.traverse(scene)
         table.properties = {p.key: table.properties[p.key] for p in self.chosen}
         return table

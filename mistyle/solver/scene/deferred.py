@@ -15,13 +15,16 @@ from jaxtyping import Float
 
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.capture import in_memory
+from mistyle.core.image import dilate
 from mistyle.core.light import Directional, Point
 from mistyle.core.mesh import Mesh
 from mistyle.core.rows import evenly
 from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live import walk as scene_walk
 from mistyle.render.live.parameters import Parameter
+from mistyle.render.mitsuba.device import mi
 from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
 from mistyle.solver.scene import gradients as scene_grad
 
@@ -128,15 +131,11 @@ class DeferredRenderer:
         counts = np.array(view.counts)[..., 0].astype(bool)
         foreign = [k for k, material in enumerate(self.materials) if material is None]
         if foreign:
-            from mistyle.core.image import dilate
-
             counts &= ~dilate(np.isin(gbuffer(traced, camera).part, foreign), 1)
         return counts
 
     def _best_variant(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
         """The renderer that matches the scene best, over Mitsuba's variants of a normal map."""
-        from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
-
         sizes = [(2, 2) if m is None else m.size for m in self.materials]
         bumped = any("normalmap" in m.roles for m in self.materials if m is not None)
         looked = evenly(len(views), CHECKS)
@@ -214,8 +213,6 @@ def _missing(scene: Any, parameter: Parameter, reasons: Mapping[str, str | None]
 
 def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTexels | None]:
     """One per shape; None where the fast path cannot shade it."""
-    import mitsuba as mi
-
     keys: dict[Any, str] = {}
     for key, (_, _, node, _) in mi.traverse(scene).properties.items():
         if key.endswith((".data", ".value")):
@@ -234,8 +231,6 @@ def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTe
 
 
 def _material(shape: Any, held: Mapping[Any, list], keys: Mapping[Any, str]) -> MaterialTexels:
-    import mitsuba as mi
-
     roles: dict[str, tuple[str, np.ndarray]] = {}
     bsdf: Any = shape.bsdf()
     while bsdf.class_name() != "Principled":
@@ -252,7 +247,7 @@ def _material(shape: Any, held: Mapping[Any, list], keys: Mapping[Any, str]) -> 
     sizes = {value.shape[:2] for _, value in roles.values() if value.ndim == 3}
     if len(sizes) > 1:
         raise Unsupported(f"the textures of {shape.id()} differ in size.")
-    table: Any = mi.traverse(bsdf)
+    table = mi.traverse(bsdf)
     own = next((table[key] for key in table.keys() if key == "specular"), None)
     if own is None:
         raise Unsupported(f"the material of {shape.id()} is given by eta, not by specular.")
@@ -261,9 +256,7 @@ def _material(shape: Any, held: Mapping[Any, list], keys: Mapping[Any, str]) -> 
 
 
 def _stored(texture: Any, keys: Mapping[Any, str]) -> tuple[str, np.ndarray]:
-    import mitsuba as mi
-
-    table: Any = mi.traverse(texture)
+    table = mi.traverse(texture)
     if "to_uv" in table.keys() and not np.allclose(np.array(table["to_uv"].matrix).squeeze(), np.eye(3), atol=1e-6):
         raise Unsupported("a texture is transformed (to_uv).")
     name = next((n for n in ("data", "value") if n in table.keys()), None)
@@ -274,9 +267,7 @@ def _stored(texture: Any, keys: Mapping[Any, str]) -> tuple[str, np.ndarray]:
 
 
 def _light(emitter: Any) -> Directional | Point:
-    import mitsuba as mi
-
-    table: Any = mi.traverse(emitter)
+    table = mi.traverse(emitter)
     name = {"DirectionalEmitter": "irradiance", "PointLight": "intensity"}.get(emitter.class_name())
     if name is None or f"{name}.value" not in table.keys():
         raise Unsupported(f"a light is {emitter.class_name()}.")
@@ -291,11 +282,9 @@ def _light(emitter: Any) -> Directional | Point:
 
 
 def _camera(sensor: Any, k: int) -> Camera:
-    import mitsuba as mi
-
     film: Any = sensor.film()
     columns, rows = (int(n) for n in film.size())
-    table: Any = mi.traverse(sensor)
+    table = mi.traverse(sensor)
     if sensor.class_name() != "PerspectiveCamera" or tuple(film.crop_size()) != tuple(film.size()):
         raise Unsupported(f"sensor {k} is {sensor.class_name()}, or its film is cropped.")
     if film.rfilter().class_name() != "BoxFilter":
@@ -316,12 +305,10 @@ def _camera(sensor: Any, k: int) -> Camera:
 
 def _mesh(scene: Any) -> Mesh:
     """All shapes as one mesh in the scene's units, one part each."""
-    import mitsuba as mi
-
     positions, faces, normals, uvs, part, names = [], [], [], [], [], []
     count = 0
     for k, shape in enumerate(scene.shapes()):
-        table: Any = mi.traverse(shape)
+        table = mi.traverse(shape)
         vertices = np.array(table["vertex_positions"], dtype=np.float32).reshape(-1, 3)
         face = np.array(table["faces"]).reshape(-1, 3).astype(np.int32)
         own = np.array(table["vertex_normals"], dtype=np.float32).reshape(-1, 3)

@@ -22,6 +22,7 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.render.live import walk as scene_walk
 from mistyle.render.live.parameters import Parameter
 from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.device import dr, mi
 
 # (picture, reference) -> number; both Mitsuba tensors (h, w, 3), linear
 Loss = Callable[[Any, Any], Any]
@@ -49,22 +50,16 @@ def log_srgb_l1(picture: Any, reference: Any) -> Any:
 
     Highlights weigh as much as their surroundings.
     """
-    import drjit as dr
-
     return dr.mean(dr.abs(_log_srgb(picture) - _log_srgb(reference)), axis=None)
 
 
 def l2(picture: Any, reference: Any) -> Any:
     """Mean squared difference of linear radiance."""
-    import drjit as dr
-
     return dr.mean(dr.square(picture - reference), axis=None)
 
 
 def relative(weights: Any) -> Loss:
     """Mean weights · (picture - reference)², with the weights of `relative_weights` as a tensor."""
-    import drjit as dr
-
     return lambda picture, reference: dr.mean(weights * dr.square(picture - reference), axis=None)
 
 
@@ -111,10 +106,8 @@ def loss_of(loss: str | Loss, view: ReferenceView) -> Loss:
 
 
 def _log_srgb(linear: Any) -> Any:
-    import drjit as dr
-
-    x: Any = dr.log(dr.maximum(linear, 0) + 1)
-    root: Any = dr.power(dr.maximum(x, 0.0031308), 1 / 2.4)
+    x = dr.log(dr.maximum(linear, 0) + 1)
+    root = dr.power(dr.maximum(x, 0.0031308), 1 / 2.4)
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * root - 0.055)
 
 
@@ -122,13 +115,11 @@ def ad_integrator(scene: Any, requested: Any = None) -> tuple[Any, tuple[str, ..
     """An integrator with gradients, and notes: `requested` (a plugin's name, a dictionary or an integrator), else the
     scene's own if it has gradients, else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own.
     """
-    import mitsuba as mi
-
     if isinstance(requested, mi.Integrator):
         return requested, ()
     if requested is not None:
         try:
-            integrator: Any = mi.load_dict({"type": requested} if isinstance(requested, str) else dict(requested))
+            integrator = mi.load_dict({"type": requested} if isinstance(requested, str) else dict(requested))
         except RuntimeError as error:
             raise UsageError(
                 f"the integrator '{requested}' cannot be made; expected for example 'prb'. {error}"
@@ -157,9 +148,6 @@ def ad_integrator(scene: Any, requested: Any = None) -> tuple[Any, tuple[str, ..
 
 def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str) -> ReferenceView:
     """Check one reference picture against its camera. Raises InputRefused, calling the camera `name`."""
-    import mitsuba
-
-    mi: Any = mitsuba
     film: Any = sensor.film()
     columns, rows = (int(n) for n in film.crop_size())
     if reference.ndim != 3 or reference.shape[2] != 3:
@@ -203,9 +191,6 @@ def seeds(*numbers: int) -> tuple[int, int]:
 
 def picture(scene: Any, integrator: Any, sensor: Any, spp: int, seed: int) -> Any:
     """The linear picture, a tensor without gradient; memory is bounded by 64 samples a pixel."""
-    import drjit as dr
-    import mitsuba as mi
-
     times, each = scenery.passes(spp)
     total: Any = 0
     with dr.suspend_grad():
@@ -222,9 +207,6 @@ def compare(shown: Any, view: ReferenceView, loss: Loss) -> tuple[float, Any, in
 
     Pixels that are masked, NaN or infinite are set to the reference's, so they have no gradient.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     moving = mi.TensorXf(dr.detach(shown))
     dr.enable_grad(moving)
     three = moving[..., :3]
@@ -260,9 +242,6 @@ def gradients(
 
     The values are written into the scene first. `spp` and `seeds`: of the picture, then of the gradient.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     scene, table, chosen, integrator = live.scene, live.table, live.chosen, live.integrator
     # New variables each time: a backward pass frees the graph of the previous one.
     moving = put(table, chosen, values, grad=True)
@@ -289,9 +268,6 @@ def derivative(
 
     Non-finite values are zero.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     table = live.table
     along = mi.Float(0)
     dr.enable_grad(along)
@@ -310,8 +286,6 @@ def regularized(
     table: Any, chosen: Sequence[Parameter], values: Mapping[str, np.ndarray], penalties: Sequence[Any]
 ) -> tuple[float, dict[str, np.ndarray]]:
     """The sum of the regularizers and its gradient by key."""
-    import drjit as dr
-
     moving = {p.key: typed(type(table[p.key]), values[p.key]) for p in chosen}
     dr.enable_grad(moving)
     total: Any = sum(penalty(moving) for penalty in penalties)
@@ -332,8 +306,6 @@ def put(
     table: Any, chosen: Sequence[Parameter], values: Mapping[str, np.ndarray], grad: bool = False
 ) -> dict[str, Any]:
     """Set parameters of the scene, with gradients enabled by `grad`. Returns the values as set."""
-    import drjit as dr
-
     result = {}
     for parameter in chosen:
         result[parameter.key] = typed(type(table[parameter.key]), values[parameter.key])
@@ -351,9 +323,6 @@ def array(value: Any, parameter: Parameter) -> np.ndarray:
 
 def typed(kind: Any, values: np.ndarray) -> Any:
     """The inverse of `array`; never a literal, which would compile a kernel for each value."""
-    import drjit as dr
-    import mitsuba as mi
-
     if dr.is_tensor_v(kind):
         return kind(mi.TensorXf(aligned(values)))
     if dr.depth_v(kind) > 1:

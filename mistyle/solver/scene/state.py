@@ -11,8 +11,10 @@ from mistyle.core.errors import UsageError
 from mistyle.render.deferred import pyramid as laplacian
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live.parameters import Parameter
+from mistyle.render.mitsuba.device import mi
 from mistyle.solver.scene import gauss_newton as scene_newton
 from mistyle.solver.scene import gradients as scene_grad
+from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
 
 FEWEST_VIEWS = 3
 SOLVERS = ("auto", "adam", "gauss-newton")
@@ -125,8 +127,6 @@ def prepare(
     fast: bool = True,
 ) -> tuple[SceneProblem, list[str]]:
     """Validate the inputs and assemble the problem; returns it with notes."""
-    import mitsuba as mi
-
     keys, loss, regularizers = unknowns.keys, objective.loss, objective.regularizers
     counts = [plan.iterations, plan.spp, plan.sensors_per_step, 1 if plan.spp_grad is None else plan.spp_grad]
     if min(counts) < 1 or not plan.rate > 0:
@@ -191,8 +191,6 @@ def _free_masks(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> 
 
 def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
     """The fast path, or the reason why it does not apply."""
-    from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
-
     try:
         return DeferredRenderer(scene, chosen, views, loss if isinstance(loss, str) else "", engine), ""
     except Unsupported as reason:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.mesh import Mesh
-from mistyle.core.rows import corner_rows, distinct
+from mistyle.core.rows import corner_rows, distinct, sums, unit
 from mistyle.geometry.normals import area_vectors, same_points
 
 
@@ -34,12 +34,12 @@ def turned_normals(mesh: Mesh, positions: Float[np.ndarray, "v 3"]) -> Float[np.
     normals = mesh.corner_normals.reshape(-1, 3)
     kinds, group = distinct(corner_rows(point, normals.astype(np.float32)))
     before, after = (
-        _sums(group, np.repeat(area_vectors(p, mesh.faces), 3, axis=0), len(kinds)) for p in (mesh.positions, positions)
+        sums(group, np.repeat(area_vectors(p, mesh.faces), 3, axis=0), len(kinds)) for p in (mesh.positions, positions)
     )
     changed = (before != after).any(axis=1)
     result = normals.copy()
     corners = np.flatnonzero(changed[group])
-    turned = _turned(normals[corners].astype(np.float64), _unit(before)[group[corners]], _unit(after)[group[corners]])
+    turned = _turned(normals[corners].astype(np.float64), unit(before)[group[corners]], unit(after)[group[corners]])
     result[corners] = turned.astype(normals.dtype)
     return result.reshape(-1, 3, 3)
 
@@ -54,12 +54,3 @@ def _turned(
     across = np.cross(axis, vectors)
     turned = vectors + across + np.cross(axis, across) / np.where(good, 1 + cosine, 1)
     return np.where(good, turned, vectors)
-
-
-def _sums(group: np.ndarray, values: Float[np.ndarray, "c 3"], count: int) -> Float[np.ndarray, "g 3"]:
-    return np.stack([np.bincount(group, weights=values[:, k], minlength=count) for k in range(3)], axis=1)
-
-
-def _unit(vectors: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(length > 0, length, 1)

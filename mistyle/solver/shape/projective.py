@@ -18,6 +18,7 @@ from mistyle.core.camera import Camera
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.image import gaussian
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.scene import samples, sensor_dict
 
 FILTER = 0.5  # pixels, standard deviation of the film's filter
@@ -37,9 +38,6 @@ def silhouette_loss(
 ) -> tuple[float, Float[np.ndarray, "n 3"]]:
     """Mean squared difference of the rendered coverages from the targets, and its gradient by the points (zero unless
     requested)."""
-    import drjit as dr
-    import mitsuba as mi
-
     device.use()
     scene = mi.load_dict(
         {
@@ -72,8 +70,6 @@ def silhouette_loss(
 
 def _shape(points: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Any:
     """A black mesh with face normals."""
-    import mitsuba as mi
-
     props = mi.Properties()
     props["mesh_bsdf"] = mi.load_dict(
         {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}}

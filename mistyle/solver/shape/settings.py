@@ -2,7 +2,9 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, Field
+
+from mistyle.core.settings import FrozenModel
 
 
 def share(value: Any) -> Any:
@@ -15,10 +17,8 @@ def share(value: Any) -> Any:
     return value
 
 
-class DisplaceSettings(BaseModel):
+class DisplaceSettings(FrozenModel):
     """How far and how smoothly the mesh follows the outlines of stylized views (paper 6.2.2)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     most: Annotated[float, BeforeValidator(share)] = Field(
         default=0.0,

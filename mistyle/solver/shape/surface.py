@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.mesh import Mesh
-from mistyle.core.rows import distinct
+from mistyle.core.rows import distinct, unit
 from mistyle.geometry.normals import area_vectors, same_points
 
 LEAST_COTANGENT, MOST_COTANGENT = 0.02, 5.0  # of an edge; slivers would otherwise stiffen or free it
@@ -63,8 +63,7 @@ def normals_of(surface: WeldedSurface, points: Float[np.ndarray, "n 3"]) -> Floa
     for k in range(3):
         for axis in range(3):
             total[:, axis] += np.bincount(surface.faces[:, k], weights=vectors[:, axis], minlength=len(points))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return total / np.where(length > 0, length, 1)
+    return unit(total)
 
 
 def plate(surface: WeldedSurface) -> Any:

@@ -6,6 +6,8 @@ each depends on its own albedo alone. Everything is unrolled over Dr.Jit arrays,
 
 from typing import Any, NamedTuple
 
+from mistyle.render.mitsuba.device import dr
+
 # Pivots below this share of the diagonal have no significant digits in single precision.
 DIGITS = 1e-6
 
@@ -23,8 +25,6 @@ class Sums(NamedTuple):
 
 def step(sums: Sums, x: list, mean: list, prior: list, damping: Any) -> list:
     """The damped Gauss–Newton step: (H + prior + damping diag) step = gradient."""
-    import drjit as dr
-
     ga = [dr.fma(p, v - m, g) for g, v, m, p in zip(sums.ga, x[:3], mean[:3], prior[:3], strict=True)]
     gq = [dr.fma(p, v - m, g) for g, v, m, p in zip(sums.gq, x[3:], mean[3:], prior[3:], strict=True)]
     grow = 1 + damping
@@ -46,8 +46,6 @@ def step(sums: Sums, x: list, mean: list, prior: list, damping: Any) -> list:
 
 def _reduced(sums: Sums, inverse: list, prior: list, grow: Any) -> list:
     """Schur complement of the albedo, as a lower triangle."""
-    import drjit as dr
-
     result = []
     for q in range(4):
         for p in range(q + 1):
@@ -62,8 +60,6 @@ def _reduced(sums: Sums, inverse: list, prior: list, grow: Any) -> list:
 
 def spread_of(sums: Sums, prior: list) -> tuple[list, list]:
     """Square roots of the inverse's diagonal, and the diagonal of the normal matrix."""
-    import drjit as dr
-
     inverse = [1 / dr.maximum(h + p, 1e-12) for h, p in zip(sums.aa, prior[:3], strict=True)]
     factor = _cholesky(_reduced(sums, inverse, prior, 1), _least(sums, prior))
     kind = type(sums.cost)
@@ -83,15 +79,11 @@ def spread_of(sums: Sums, prior: list) -> tuple[list, list]:
 
 def _least(sums: Sums, prior: list) -> list:
     """Lower bound of the pivots: below it the Schur complement has no significant digits in single precision."""
-    import drjit as dr
-
     return [dr.maximum(DIGITS * sums.qq[triangle(q, q)], dr.maximum(prior[3 + q], 1e-10)) for q in range(4)]
 
 
 def _cholesky(lower: list, least: list) -> list:
     """Factor of a 4 x 4 matrix given as a lower triangle; diagonal entries of the factor are stored inverted."""
-    import drjit as dr
-
     factor = list(lower)
     for q in range(4):
         for p in range(q + 1):
@@ -120,8 +112,6 @@ def triangle(q: int, p: int) -> int:
 
 
 def nothing(kind: Any, width: int) -> Sums:
-    import drjit as dr
-
     def zeros(count):
         return [dr.zeros(kind, width) for _ in range(count)]
 

@@ -14,6 +14,7 @@ from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred.image_samples import BLOCK_RAYS, camera_rays
 from mistyle.render.deferred.sky import bin_environment, even_directions
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.texels.levenberg_marquardt import Rig
 
@@ -39,10 +40,6 @@ def trace_gbuffer(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> GB
 
     Lights are Directional or Point; their frame "camera" is that of `camera`. Shadow rays start where Mitsuba's do.
     """
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     device.use()
     height, width = camera.size
     position, normal = np.zeros((height * width, 3), np.float32), np.zeros((height * width, 3), np.float32)
@@ -116,10 +113,6 @@ def open_sky(
 ) -> UInt32[np.ndarray, "n w"]:
     """Visibility of directions (default: the SKY_CELLS cells) from points just above the surface, as packed bits: bit
     k % 32 of word k // 32."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     device.use()
     origin = mi.Point3f(*(mi.Float(aligned(c)) for c in (position + 1e-3 * normal).T))
     directions = even_directions(SKY_CELLS) if directions is None else directions
@@ -131,26 +124,7 @@ def open_sky(
     return words
 
 
-def reaches(
-    traced: Tracer, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "3"]
-) -> Bool[np.ndarray, " n"]:
-    """Whether segments from points just above the surface to the world point `target` meet no face."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
-    device.use()
-    origin = mi.Point3f(*(mi.Float(aligned(c)) for c in (position + 1e-3 * normal).T))
-    away = mi.Point3f(np.asarray(target, float).tolist()) - origin
-    distance = dr.norm(away)
-    ray = mi.Ray3f(origin, away / distance, distance * (1 - 1e-4), 0.0, [])
-    return ~np.array(traced.scene.ray_test(ray))
-
-
 def _shadow(point: Any, light: Light, camera: Camera) -> Any:
-    import mitsuba
-
-    mi: Any = mitsuba
     if isinstance(light, Directional):
         return point.spawn_ray(mi.Vector3f(direction_in_world(light, camera).tolist()))
     if isinstance(light, Point):

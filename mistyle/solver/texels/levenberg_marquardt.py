@@ -26,6 +26,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.solver.texels.algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
 from mistyle.solver.texels.records import UNKNOWNS, Observations, Options, Points, Rig, Solution
 from mistyle.solver.texels.response import derivatives, differences, terms
@@ -41,9 +42,6 @@ class Problem:
 
     def __init__(self, points: Points, rig: Rig, observations: Observations, options: Options) -> None:
         device.use()
-        import mitsuba
-
-        mi: Any = mitsuba
         self.options, self.single, self.soft = options, rig.single, rig.cells is not None
         self.texels = len(points.position)
         count = np.diff(observations.start)
@@ -70,17 +68,11 @@ class Problem:
 
     def relight(self, irradiance: Float[np.ndarray, "l 3"]) -> None:
         """Replace the lights' irradiance; rows in the order of the Rig."""
-        import mitsuba
-
-        mi: Any = mitsuba
         self.lights[:, 4:7] = irradiance
         self.rig["light"] = mi.Float(aligned(self.lights.ravel()))
 
     def reweight(self, weight: Float[np.ndarray, " o"]) -> None:
         """Replace the weights."""
-        import mitsuba
-
-        mi: Any = mitsuba
         for chunk in self.chunks:
             chunk["weight"] = mi.Float(aligned(np.where(chunk["real"], weight[chunk["rows"]], 0)))
 
@@ -108,8 +100,6 @@ class Problem:
 
     def predict(self, values: Float[np.ndarray, "t 7"]) -> Float[np.ndarray, "o 3"]:
         """The model's radiance of every observation."""
-        import drjit as dr
-
         total = max((int(chunk["rows"].max()) for chunk in self.chunks), default=-1) + 1
         result = np.zeros((total, 3), np.float32)
         for chunk in self.chunks:
@@ -122,8 +112,6 @@ class Problem:
         return result
 
     def _scatter(self, chunk: dict, x: list, seen: list) -> Any:
-        import drjit as dr
-
         def body(k, done):
             index = k * chunk["width"] + chunk["lane"]
             linear, constant, _, _ = self._response(chunk, index, x, slopes=False)
@@ -135,8 +123,6 @@ class Problem:
         return dr.while_loop(start, lambda k, done: k < chunk["count"], body)
 
     def _solve(self, chunk: dict, start, mean, prior, iterations: int) -> tuple[np.ndarray, ...]:
-        import drjit as dr
-
         mean, prior = _columns(mean), _columns(prior)
         first = _project(_columns(start), self.options)
         kind, width = type(first[0]), chunk["width"]
@@ -170,8 +156,6 @@ class Problem:
 
     def _accumulate(self, chunk: dict, x: list) -> Sums:
         """Normal matrix, gradient and cost of every lane at x."""
-        import drjit as dr
-
         kind, huber = type(x[0]), self.options.huber
 
         def body(k, *flat):
@@ -210,10 +194,6 @@ class Problem:
 
     def _response(self, chunk: dict, index: Any, x: list, *, slopes: bool) -> tuple[list, list, list, list]:
         """Both terms of the reflectance times irradiance per channel, and their derivatives by all but the albedo."""
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba
         picture = dr.gather(mi.UInt32, chunk["picture"], index)
         eye = dr.gather(mi.Point3f, self.rig["eye"], picture)
         wi = local(chunk["frame"], dr.normalize(eye - chunk["position"]))
@@ -240,10 +220,6 @@ class Problem:
         return _unflat4(done[1:], slopes)
 
     def _light(self, chunk: dict, light: Any, scale: Any, wi: Any, x: list, slopes: bool) -> tuple:
-        import drjit as dr
-        import mitsuba
-
-        mi: Any = mitsuba
         row = [dr.gather(mi.Float, self.rig["light"], light * 8 + k) for k in range(7)]
         near = row[3] > 0.5
         vector = mi.Vector3f(row[0], row[1], row[2])
@@ -264,8 +240,6 @@ class Problem:
 
 
 def _project(x: list, options: Options) -> list:
-    import drjit as dr
-
     length = dr.sqrt(dr.square(x[3]) + dr.square(x[4]))
     scale = dr.minimum(1, options.tilt / dr.maximum(length, 1e-9))
     colour = [dr.clip(v, 0, 1) for v in x[:3]]
@@ -291,15 +265,10 @@ def _unflat4(flat: Any, slopes: bool) -> tuple[list, list, list, list]:
 
 def local(frame: tuple, vector: Any) -> Any:
     """A world vector in the texels' frames."""
-    import drjit as dr
-
     return type(vector)(dr.dot(frame[0], vector), dr.dot(frame[1], vector), dr.dot(frame[2], vector))
 
 
 def _columns(values: Float[np.ndarray, "n c"]) -> list:
-    import mitsuba
-
-    mi: Any = mitsuba
     return [mi.Float(aligned(values[:, j])) for j in range(values.shape[1])]
 
 
@@ -317,10 +286,6 @@ def _light_rows(rig: Rig) -> Float[np.ndarray, "l 8"]:
 
 def _chunk(points: Points, seen: Observations, texel: Int[np.ndarray, " n"], count: Int[np.ndarray, " n"]) -> dict:
     """One chunk's observations, the k-th of all lanes together; `rows` are their indices, `real` marks valid slots."""
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     width, most = len(texel), int(count[0])
     slot = np.arange(most)[:, None]
     real = (slot < count).ravel()

@@ -1,11 +1,10 @@
 """Light transport matrix: radiance that each cell of the sky contributes to each observation of the solver."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.drjit_arrays import aligned
+from mistyle.render.mitsuba.device import dr, mi
 from mistyle.solver.texels.levenberg_marquardt import Problem, local
 from mistyle.solver.texels.response import terms
 
@@ -18,10 +17,6 @@ def light_transport_matrix(
     The problem's pictures have `cells` cells of the sky and no other light; the model's radiance in channel c is
     sum_k E_kc (albedo_c paint_k + gloss_k), as in `texels/levenberg_marquardt.py`.
     """
-    import drjit as dr
-    import mitsuba
-
-    mi: Any = mitsuba
     linear, constant = np.zeros((observations, cells), np.float32), np.zeros((observations, cells), np.float32)
     for chunk in problem.chunks:
         width = chunk["width"]

@@ -3,6 +3,7 @@
 from typing import Any
 
 from mistyle.render.deferred import bsdf
+from mistyle.render.mitsuba.device import dr
 from mistyle.solver.texels.records import Options
 
 STEP = 1e-3  # of central differences, the twin of the derivatives by AD
@@ -14,8 +15,6 @@ def terms(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tu
 
     GGX's α² is twice the variance of the microfacet slopes, and normals turn half as much as the light does.
     """
-    import drjit as dr
-
     z = dr.sqrt(dr.maximum(1 - dr.square(q[0]) - dr.square(q[1]), MIN_Z2))
     normal = type(wi)(q[0], q[1], z)
     roughness = q[2] if width2 is None else dr.sqrt(dr.sqrt(dr.square(dr.square(q[2])) + 0.5 * width2))
@@ -25,8 +24,6 @@ def terms(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tu
 
 def derivatives(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tuple[Any, Any, list, list]:
     """By forward-mode AD: the operations that several directions share are compiled once."""
-    import drjit as dr
-
     moving = [type(v)(v) for v in q]
     dr.enable_grad(moving)
     linear, constant, _, _ = terms(options, wi, wo, moving, width2)
@@ -48,8 +45,6 @@ def derivatives(options: Options, wi: Any, wo: Any, q: list, width2: Any = None)
 
 
 def differences(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tuple[Any, Any, list, list]:
-    import drjit as dr
-
     linear, constant, _, _ = terms(options, wi, wo, q, width2)
     d_linear, d_constant = [], []
     for j in range(4):

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,10 +13,12 @@ from mistyle.core.image import resize
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps
 from mistyle.core.stage_progress import StageProgress
-from mistyle.render.deferred.material_table import METALLIC, SOLVED, MaterialTable
+from mistyle.render.deferred.material_table import METALLIC, SOLVED, MaterialTable, pack, unpack
+from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.solver import prior as recover_prior
 from mistyle.solver.context import DirectCaptures, FitContext, Radiance
 from mistyle.solver.deviation import open_std
+from mistyle.solver.indirect import Indirect, in_proportion
 from mistyle.solver.journal import Journal
 from mistyle.solver.schedule import Pass, rounds_since, solver_level
 from mistyle.solver.table import PRIOR_MEAN, Atlas, Values, linked, scatter, scatter_to_atlas
@@ -30,9 +32,6 @@ from mistyle.solver.texels.observations import (
     sample_image,
     with_extra_std,
 )
-
-if TYPE_CHECKING:
-    from mistyle.render.deferred.renderer import MaterialRenderer
 
 INDIRECT_STD = 0.5  # standard deviation of an estimate of indirect light, relative to it
 
@@ -67,7 +66,7 @@ class TexelLevel:
     """
 
     context: FitContext
-    renderer: "MaterialRenderer"
+    renderer: MaterialRenderer
     by: int
     observed: TexelObservations
     start: tuple[Values, Values]
@@ -76,7 +75,7 @@ class TexelLevel:
 
 def texel_level(
     context: FitContext,
-    renderer: Callable[[], "MaterialRenderer"],
+    renderer: Callable[[], MaterialRenderer],
     start: Sequence[Maps] | None,
     progress: Callable[[float], None],
 ) -> TexelLevel:
@@ -91,7 +90,7 @@ def texel_level(
         context, texels=texels, atlas=linked(mesh, texels), captures=averaged, cameras=context.captures.cameras
     )
     if start is not None:
-        start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
+        start = [shrunk_maps(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
     finer = (
         "Finer albedo comes from the pictures over the fitted shading (recover.detail)."
         if context.settings.detail
@@ -114,12 +113,11 @@ def level_factor(context: FitContext) -> int:
 
 def _level(
     context: FitContext,
-    renderer: "MaterialRenderer",
+    renderer: MaterialRenderer,
     by: int,
     start: Sequence[Maps] | None,
     progress: Callable[[float], None],
 ) -> TexelLevel:
-    from mistyle.render.deferred.material_table import pack
 
     settings = context.settings
     options = ObservationOptions(settings.facing, settings.noise, settings.relative, settings.solver != "pictures")
@@ -251,7 +249,8 @@ def _enlarged(values: np.ndarray, by: int) -> np.ndarray:
     return np.repeat(np.repeat(values, by, axis=0), by, axis=1)
 
 
-def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
+def shrunk_maps(maps: Maps, size: tuple[int, int]) -> Maps:
+    """The maps at another size, nothing known."""
     fields = {name: resize(getattr(maps, name), size) for name in ("albedo", "normal", "roughness", "metallic")}
     return Maps(known=np.zeros(size, bool), **fields)
 
@@ -261,7 +260,7 @@ class RoundResiduals:
     """A function of k: reference minus render of picture k, 0 at invalid pixels; `squares` gets its mean square."""
 
     direct: DirectCaptures
-    renderer: "MaterialRenderer"
+    renderer: MaterialRenderer
     table: Any
     squares: list[float]
     journal: Journal
@@ -293,7 +292,7 @@ def _on_atlas(
 
 def estimate_indirect(
     context: FitContext,
-    renderer: "MaterialRenderer",
+    renderer: MaterialRenderer,
     table: MaterialTable,
     sampling: tuple[int, int],
     progress: Callable[[float], None],
@@ -303,9 +302,6 @@ def estimate_indirect(
     """Each picture's number, its indirect light under the maps of `table`, and with `vectors` its vector irradiance
     (`Indirect.pictures_and_vectors`); camera by camera, without cameras whose pictures are all in `skip`. `sampling`:
     samples a pixel and seed."""
-    from mistyle.render.deferred.material_table import unpack
-    from mistyle.solver.indirect import Indirect, in_proportion
-
     settings, captures, done, (samples, seed) = context.settings, context.captures, 0, sampling
     uploaded, maps = renderer.upload(table), unpack(table, context.atlas.sizes)
     scene = Indirect(context.traced.mesh, maps, model=settings.model, frame=settings.frame)
@@ -328,7 +324,7 @@ def estimate_indirect(
 
 def journalled_light(
     context: FitContext,
-    renderer: "MaterialRenderer",
+    renderer: MaterialRenderer,
     table: MaterialTable,
     sampling: tuple[int, int],
     journal: Journal,

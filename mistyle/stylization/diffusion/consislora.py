@@ -23,7 +23,7 @@ BLOCKS: dict[Half, str] = {"content": "up_blocks.0.attentions.0", "style": "up_b
 PROJECTIONS = r"(to_q|to_k|to_v|to_out\.0)"
 
 
-def add_half(unet: Any, half: Half, rank: int, seed: int, name: str | None = None) -> None:
+def add_half(unet: Any, half: Half, rank: int, seed: int) -> None:
     """Add a new LoRA on one block: A ~ N(0, 1/rank), B = 0, scale 1, float32 over the frozen network.
 
     peft leaves only the last added adapter active; see `activate`.
@@ -41,8 +41,8 @@ def add_half(unet: Any, half: Half, rank: int, seed: int, name: str | None = Non
     )
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        unet.add_adapter(config, adapter_name=name or half)
-    for parameter in parameters(unet, name or half).values():
+        unet.add_adapter(config, adapter_name=half)
+    for parameter in parameters(unet, half).values():
         parameter.data = parameter.data.float()
 
 
@@ -95,7 +95,7 @@ def x0_loss(
     prediction: str = "epsilon",
 ) -> Float[torch.Tensor, ""]:
     """Mean squared error of the x0 predicted by the network's `output`, unweighted; equals the noise error times
-    `weight`."""
+    (1 - alpha_bar) / alpha_bar, 0.001 to 214 over SDXL's levels."""
     if prediction == "v_prediction":
         predicted = alpha_bar.sqrt() * zt - (1 - alpha_bar).sqrt() * output.float()
     else:
@@ -108,11 +108,6 @@ def velocity(
 ) -> Float[torch.Tensor, "b c h w"]:
     """The target of `v_prediction` networks: sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z0."""
     return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * z0
-
-
-def weight(alpha_bar: Float[torch.Tensor, ""]) -> Float[torch.Tensor, ""]:
-    """(1 - alpha_bar) / alpha_bar: ratio of the x0 loss to the noise error, 0.001 to 214 over SDXL's levels."""
-    return (1 - alpha_bar) / alpha_bar
 
 
 def half_names(unet: Any, name: str) -> dict[str, torch.nn.Parameter]:

@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from mistyle.core.settings import FrozenModel
 
 
-class ModelSettings(BaseModel):
+class ModelSettings(FrozenModel):
     """Model files, device, precision and memory."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     folder: Path | None = Field(
         default=None, description="folder of models as `mistyle models` writes it; else the Hugging Face cache"
@@ -37,10 +37,8 @@ class ModelSettings(BaseModel):
     memory: float = Field(default=0, ge=0, description="GB that may be used; 0: the device's free memory")
 
 
-class TrainSettings(BaseModel):
+class TrainSettings(FrozenModel):
     """ConsisLoRA training (paper 4.1.2); the numbers are those of ConsisLoRA's own scripts."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rank: int = Field(default=64, ge=1, le=1024, description="rank of the LoRAs; alpha equals it, so the scale is 1")
     steps: int = Field(default=1500, ge=1, le=100_000, description="steps of a content image and of style stage 1")
@@ -63,10 +61,8 @@ class TrainSettings(BaseModel):
     save_every: int = Field(default=100, ge=1, description="steps between checkpoints")
 
 
-class DiffusionSettings(BaseModel):
+class DiffusionSettings(FrozenModel):
     """The paper's stylizer (4.1.2, 4.1.3): SDXL with depth and Canny ControlNets, two LoRAs and RePaint."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     content: Literal["auto", "none", "shared", "per-view"] = Field(
         default="auto",
@@ -93,10 +89,8 @@ class DiffusionSettings(BaseModel):
 LIGHTING = "shadow, shade, shading, highlight, specular reflection, strong light, backlight, dimness, text"
 
 
-class Paint3dSettings(BaseModel):
+class Paint3dSettings(FrozenModel):
     """The paper's texture inpainting (4.3): SD 1.5 with the UV-position ControlNet and an IP-Adapter."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recipe: Literal["inpaint", "paint3d"] = Field(
         default="inpaint",

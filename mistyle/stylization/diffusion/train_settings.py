@@ -2,15 +2,14 @@
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from mistyle.core.settings import FrozenModel
 from mistyle.stylization.diffusion.settings import ModelSettings, TrainSettings
 
 
-class TrainJobSettings(BaseModel):
+class TrainJobSettings(FrozenModel):
     """LoRAs from pictures."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
     threads: int = Field(default=0, ge=0, le=1024, description="threads of torch; 0 takes all cores")

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.texels import pad_in_place
 from mistyle.core.asset import Asset
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import Heights
@@ -12,8 +13,8 @@ from mistyle.geometry.similarity import scale_of
 from mistyle.process import memory
 from mistyle.stylization.records import Atlas
 from mistyle.stylization.settings import Settings
+from mistyle.stylization.surface import lookup
 from mistyle.stylization.surface.layers import StyleLayers, painted_mask
-from mistyle.stylization.surface.surface_painter import surface_height
 
 
 def check_height(settings: Settings, slope: float) -> None:
@@ -36,7 +37,6 @@ def height_maps(
 
     They belong to the normal maps: a renderer that displaces the mesh by them should leave the normal map out.
     """
-    from mistyle.atlas.texels import pad_in_place
     from mistyle.stylization.pipeline.painting import pieces, texel_side, whose
 
     factor, maps = slope / scale_of(asset.source.work_from_user), []
@@ -46,7 +46,7 @@ def height_maps(
             for rows in pieces(at):
                 mask = at[rows]
                 place = texels.position[rows][mask], texels.normal[rows][mask]
-                height[rows][mask] = np.float32(factor) * surface_height(solution, *place, footprint=side)
+                height[rows][mask] = np.float32(factor) * lookup.height(solution, *place, footprint=side)
         if settings.paint.protect is not None:
             height[painted_mask(settings.paint.protect, texels)] = 0
         pad_in_place([height], texels, settings.atlas.padding)

@@ -11,11 +11,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset
 from mistyle.core.image import overlap
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
+from mistyle.render.mitsuba.draw import gbuffer, tracer
+from mistyle.render.mitsuba.unlit import unlit
 from mistyle.solver.shape.displace import Displaced, TargetOutline, displace
 from mistyle.solver.shape.settings import DisplaceSettings
 from mistyle.stylization.records import Atlas
@@ -89,16 +92,12 @@ def outline_of(
 
 def coverages(mesh: Mesh, views: Sequence[View]) -> list[Float[np.ndarray, "h w"]]:
     """The mesh's own coverage in every view, by the rays that drew the stylized views."""
-    from mistyle.render.mitsuba.unlit import unlit
-
     grey = [flat_maps(2)] * len(mesh.parts)
     return [share for _, share in unlit(mesh, grey, [view.camera for view in views])]
 
 
 def moved_atlas(asset: Asset, atlas: Atlas) -> Atlas:
     """The atlas of the displaced mesh: other surface points, the same texels and materials."""
-    from mistyle.atlas.texels import rasterise
-
     size = atlas.texels[0].covered.shape[0]
     return Atlas(tuple(rasterise(asset.mesh, part, size) for part in range(len(atlas.texels))), atlas.start)
 
@@ -108,9 +107,6 @@ def moved_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], edite
 
     The `edited` views (camera names) keep a person's pixels where the mesh now lies behind them.
     """
-    from mistyle.render.mitsuba.draw import gbuffer, tracer
-    from mistyle.render.mitsuba.unlit import unlit
-
     traced, result = tracer(asset.mesh), []
     drawn = unlit(traced, maps, [view.camera for view in views])
     for view, (rgb, share) in zip(views, drawn, strict=True):

@@ -5,7 +5,10 @@ from jaxtyping import Float
 
 from mistyle.core.camera import Camera, orbit, resized
 from mistyle.core.image import srgb_from_linear
+from mistyle.core.maps import flat_maps
 from mistyle.core.mesh import Mesh
+from mistyle.render.lookdev.scenes import asset_scene, drawn, light_rig
+from mistyle.render.mitsuba.scene import object_shapes
 
 SPP = 16
 GROUND = 0.18  # linear radiance behind the mesh
@@ -23,10 +26,6 @@ def cameras_of(views: list[Camera], size: int) -> list[Camera]:
 
 def under_key(mesh: Mesh, cameras: list[Camera], seed: int) -> Float[np.ndarray, "h w 3"]:
     """The mesh as matt grey clay from every camera, side by side, sRGB."""
-    from mistyle.core.maps import flat_maps
-    from mistyle.render.lookdev.scenes import asset_scene, drawn, light_rig
-    from mistyle.render.mitsuba.scene import object_shapes
-
     shapes = object_shapes(mesh, [flat_maps(2, 0.5, 0.9)] * len(mesh.parts))
     light, pictures = light_rig("key", None), []
     for camera in cameras:

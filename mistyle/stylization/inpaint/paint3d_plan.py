@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from mistyle.atlas.gaps import island_boxes
-from mistyle.core.image import nearest, resize
+from mistyle.core.image import bilinear, nearest, resize
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 
@@ -100,7 +100,6 @@ def spread_islands(
 
 
 def _bilinear(image: Float[np.ndarray, "h w 3"], y: np.ndarray, x: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    from mistyle.core.image import bilinear
 
     return bilinear(image, np.stack([x, y], axis=1) + 0.5)
 

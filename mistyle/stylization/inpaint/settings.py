@@ -1,12 +1,12 @@
 """Settings of the texture repair."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from mistyle.core.settings import FrozenModel
 
 
-class RepairSettings(BaseModel):
+class RepairSettings(FrozenModel):
     """Struggle mask and blending of the repair (paper 4.3)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     deviations: float = Field(
         default=0.5,

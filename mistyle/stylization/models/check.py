@@ -16,7 +16,7 @@ WORKING = {"sdxl": 4.0, "sd15": 3.0}
 PREDICTIONS = ("epsilon", "v_prediction")
 # Tensor names that mark a single-file finetune: it predicts velocities; its terminal SNR is zero.
 MARKS = {"v_pred": ("prediction_type", "v_prediction"), "ztsnr": ("rescale_betas_zero_snr", True)}
-STYLE_BLOCK, CONTENT_BLOCK = "up_blocks.0.attentions.1", "up_blocks.0.attentions.0"
+STYLE_BLOCK = "up_blocks.0.attentions.1"
 
 
 def expect(path: Path, label: str, fix: str, **expected: Any) -> dict[str, Any]:

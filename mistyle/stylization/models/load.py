@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 
 from mistyle.core.errors import EnvironmentMissing
+from mistyle.core.image import resize
 from mistyle.stylization.diffusion.settings import ModelSettings
 from mistyle.stylization.models import check as models_check
 from mistyle.stylization.models import folder as models
@@ -150,8 +151,6 @@ def settle(pipeline: Any, settings: ModelSettings, device: str) -> Any:
 
 def image_embedding(encoder: Any, rgb: Float[np.ndarray, "h w 3"]) -> torch.Tensor:
     """The pooled CLIP embedding (1, d) of an sRGB picture, stretched to a square: a crop would lose borders."""
-    from mistyle.core.image import resize
-
     size = encoder.config.image_size
     picture = resize(np.clip(rgb, 0, 1).astype(np.float32), (size, size))
     tensor = torch.from_numpy(((picture - CLIP_MEAN) / CLIP_STD).astype(np.float32)).permute(2, 0, 1)[None]

@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from mistyle.core.settings import FrozenModel
 
 
-class WarpSettings(BaseModel):
+class WarpSettings(FrozenModel):
     """Warping of earlier views into a later one (paper 4.1.3)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     fill: int = Field(default=3, ge=0, le=16, description="holes this many pixels from a painted pixel are filled")
     erosion: int | None = Field(
@@ -40,10 +40,8 @@ class WarpSettings(BaseModel):
     )
 
 
-class SweepSettings(BaseModel):
+class SweepSettings(FrozenModel):
     """The sweep over views (paper 4.1.3)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     order: Literal["angular", "paper", "given"] = Field(
         default="angular",

@@ -22,6 +22,10 @@ from mistyle.core.light import Ambient
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.process import memory
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred import pyramid, torch_bridge
+from mistyle.render.deferred.torch_bridge import Shader
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.stylization.optimise import finish_style
 from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise.finish_settings import JUDGED, FinishSettings
@@ -120,9 +124,6 @@ class Finishing:
     def __init__(
         self, painted: PaintedAsset, features: "Features", settings: FinishSettings, seed: int, bridge: Any = "frozen"
     ) -> None:
-        from mistyle.render.deferred import pyramid
-        from mistyle.render.mitsuba.draw import tracer
-
         self.painted, self.settings, self.features = painted, settings, features
         self.rng = np.random.default_rng(seed)
         self.traced = tracer(painted.mesh)
@@ -139,8 +140,6 @@ class Finishing:
     def step(self, number: int) -> None:
         """One gradient step on style and content."""
         import torch
-
-        from mistyle.render.deferred import pyramid
 
         crops = self.crops(self.rng, self.seen)
         values = self.table.values["albedo"]
@@ -195,7 +194,6 @@ class Finishing:
 
         from mistyle.measure.losses import linear_from_srgb as linear
         from mistyle.measure.losses import srgb_from_linear as encoded
-        from mistyle.render.deferred import torch_bridge
 
         picture = self.film(crops.lit, torch_bridge.fetch(linear(texels), crops.taps), moving)
         mean = torch.from_numpy(self.painted.solution.painting.mean(axis=(0, 1))).view(1, 3, 1, 1)
@@ -204,9 +202,6 @@ class Finishing:
     def crops(self, rng: np.random.Generator, seen: Float[np.ndarray, " n"]) -> Crops:
         """Crops at the least seen of random surface points; `seen` counts views of the painter's samples."""
         import torch
-
-        from mistyle.render.deferred import integrator as deferred
-        from mistyle.render.deferred import torch_bridge
 
         n, size, solution = self.settings.crops, self.settings.crop_size, self.painted.solution
         cameras = []
@@ -280,8 +275,6 @@ class Film:
     """
 
     def __init__(self, crops: int, size: int, bridge: Any) -> None:
-        from mistyle.render.deferred.torch_bridge import Shader
-
         self.shape = crops, size
         self.shader = Shader((crops * size, size), gloss=False, bridge=bridge)
 

@@ -3,16 +3,16 @@
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from mistyle.core.settings import FrozenModel
 
 JUDGED = 3  # batches of held-out crops that compare before and after
 JUDGING = 0.4  # cost of such a batch, in steps: nothing is differentiated
 
 
-class FinishSettings(BaseModel):
+class FinishSettings(FrozenModel):
     """VGG-19 style losses on many rendered crops, after the painting and before the fit."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     method: Literal["off", "vgg"] = Field(
         default="off", description="vgg: style losses of VGG-19 move the painted albedo (needs --vgg FILE)"

@@ -20,8 +20,12 @@ from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Directional, Lights, direction_in_world
 from mistyle.core.maps import Maps, rows_of
 from mistyle.core.view import View
-from mistyle.measure.overlap import Overlap
+from mistyle.measure import metrics
+from mistyle.measure.overlap import Overlap, overlap
 from mistyle.process import memory
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred import torch_bridge
+from mistyle.render.deferred.torch_bridge import CHANNELS, Shader
 
 VIEWS = 6
 WINDOW = 256
@@ -56,11 +60,6 @@ class EvaluationSet:
 
 def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[View]) -> EvaluationSet:
     """Windows of up to VIEWS evenly chosen targets, around the centre of their foreground; WINDOW pixels at most."""
-    from mistyle.measure import metrics
-    from mistyle.measure.overlap import overlap
-    from mistyle.render.deferred import integrator as deferred
-    from mistyle.render.deferred.torch_bridge import Shader
-
     count = min(VIEWS, len(targets))
     size = min(WINDOW, *(min(view.camera.size) for view in targets))
     views, neighbours = [], []
@@ -94,8 +93,6 @@ def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets:
 
 def evaluate(where: EvaluationSet, maps: Sequence[Maps], lights: Lights, *, gloss: bool = True) -> dict[str, float]:
     """The metrics detail, style and views of `maps` under `lights`, with or without dielectric reflection."""
-    from mistyle.measure import metrics
-
     lit = any(isinstance(light, Directional) for light in lights)
     table = _tables(maps)
     encoded, errors = [], []
@@ -105,7 +102,7 @@ def evaluate(where: EvaluationSet, maps: Sequence[Maps], lights: Lights, *, glos
         first, second = (_draw(where, table, surface, fixed, gloss) for surface in surfaces)
         rendered, target = srgb_from_linear(first), srgb_from_linear(second)
         contrast = float(np.abs(metrics.detail(rendered, view.mask))[view.mask].mean())
-        errors.append(metrics.shared_error(shared, rendered, target) / max(contrast, 1e-3))
+        errors.append(metrics.warp_error(shared, rendered, target) / max(contrast, 1e-3))
         encoded.append(srgb_from_linear(_exposed(first, view)) if lit else rendered)
     compared = zip(encoded, where.details, where.masks, strict=True)
     details = [
@@ -163,7 +160,6 @@ def _window(view: View, centre: Float[np.ndarray, "2"], size: int) -> View:
 
 
 def _tables(maps: Sequence[Maps]) -> tuple[list[tuple[int, int]], Float[np.ndarray, "t 8"]]:
-    from mistyle.render.deferred.torch_bridge import CHANNELS
 
     sizes = [m.roughness.shape for m in maps]
     parts = rows_of(sizes)
@@ -178,9 +174,6 @@ def _tables(maps: Sequence[Maps]) -> tuple[list[tuple[int, int]], Float[np.ndarr
 
 def _draw(where: EvaluationSet, table: tuple, surface: Any, lights: Lights, gloss: bool) -> Float[np.ndarray, "h w 3"]:
     import torch
-
-    from mistyle.render.deferred import integrator as deferred
-    from mistyle.render.deferred import torch_bridge
 
     sizes, values = table
     pixels = torch.from_numpy(torch_bridge.bilinear(values, torch_bridge.taps(surface, sizes)))

@@ -7,6 +7,7 @@ import numpy as np
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
+from mistyle.render.mitsuba.occlusion import open_sky
 
 LOOKED_AT = 40_000  # upper limit of texels, evenly over the sets: enough for two digits
 
@@ -16,8 +17,6 @@ def light_left(
 ) -> BakedLight | None:
     """The albedo's dependence on surface direction and openness, from about `most` texels; None without covered
     texels."""
-    from mistyle.render.mitsuba.occlusion import ambient_occlusion
-
     covered = sum(int(texels.covered.sum()) for texels in sets)
     if covered == 0:
         return None
@@ -31,4 +30,5 @@ def light_left(
         flat = (values.reshape(-1, 3)[at] for values in (chosen.albedo, texels.position, texels.normal))
         samples.append((*flat, weight))
     albedo, positions, normals, weight = (np.concatenate(columns) for columns in zip(*samples, strict=True))
-    return baked_light(albedo, normals, ambient_occlusion(mesh, positions, normals, seed=seed), weight)
+    share = open_sky(mesh, positions, normals, seed=seed)[:, 3].copy()
+    return baked_light(albedo, normals, share, weight)

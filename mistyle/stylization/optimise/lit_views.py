@@ -21,7 +21,12 @@ from mistyle.core.light import Lights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+from mistyle.render.mitsuba.draw import tracer
+from mistyle.render.mitsuba.unlit import unlit
 from mistyle.solver.recover import Recovered, recover
+from mistyle.solver.texels.solve import shrunk_maps
 from mistyle.stylization.mvst.unlight import BOUND, LEAST, STROKE, blurred
 from mistyle.stylization.optimise.settings import FitSettings, lit_solver
 from mistyle.stylization.optimise.table import ROUGHNESS_FLOOR
@@ -118,7 +123,7 @@ def solve(
     """Normal, roughness and albedo from the views, at the resolution that the views resolve."""
     by = shrinkage(mesh, texels, lit.views, settings.texels_per_pixel)
     coarse = [t if by == 1 else rasterise(mesh, k, len(t.covered) // by) for k, t in enumerate(texels)]
-    start = [_shrunk(m, t.covered.shape) for m, t in zip(maps, coarse, strict=True)]
+    start = [shrunk_maps(m, t.covered.shape) for m, t in zip(maps, coarse, strict=True)]
     targets, captures = lit.views, lit.captures()
     chosen = lit_solver(settings, has_soft(captures.lights))
     recovered = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
@@ -129,17 +134,15 @@ def solve(
     return Solved(tuple(start), fitted, tuple(unlit), residual, trace, recovered.notes)
 
 
-def laid(
-    maps: Sequence[Maps], start: Sequence[Maps], solved: Sequence[Maps], names: Sequence[str] = DESCRIBED
-) -> list[Maps]:
-    """`maps` plus the change from `start` to `solved` in the fields `names`.
+def laid(maps: Sequence[Maps], start: Sequence[Maps], solved: Sequence[Maps]) -> list[Maps]:
+    """`maps` plus the change from `start` to `solved`.
 
     `start` and `solved` have the solution's coarser resolution; `start` is the shrunk `maps`. Finer detail stays.
     """
     result = []
     for fine, before, after in zip(maps, start, solved, strict=True):
         size, fields = fine.roughness.shape, {}
-        for name in names:
+        for name in DESCRIBED:
             change = (getattr(after, name) - getattr(before, name)).astype(np.float32)
             if change.any():
                 moved = getattr(fine, name) + (change if change.shape[:2] == size else resize(change, size))
@@ -153,11 +156,6 @@ def _allowed(name: str, values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray
         values = values * np.array([1, 1, 0], np.float32) + np.maximum(values[..., 2:], LEAST_Z) * np.array([0, 0, 1])
         return (values / np.linalg.norm(values, axis=-1, keepdims=True)).astype(np.float32)
     return np.clip(values, ROUGHNESS_FLOOR if name == "roughness" else 0, 1).astype(np.float32)
-
-
-def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
-    fields = {name: resize(getattr(maps, name), size) for name in DESCRIBED}
-    return Maps(known=np.zeros(size, bool), **fields)
 
 
 def _where_seen(recovered: Recovered, start: Sequence[Maps], texels: Sequence[Texels], k: int) -> Maps:
@@ -174,11 +172,6 @@ def _explained(
     mesh: Mesh, captures: Captures, both: tuple[Sequence[Maps], Sequence[Maps]], targets: Sequence[View]
 ) -> tuple[tuple[float, float], list[View]]:
     """The residuals of two solutions, and the unlit views by the second one."""
-    from mistyle.render.deferred.material_table import pack
-    from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
-    from mistyle.render.mitsuba.draw import tracer
-    from mistyle.render.mitsuba.unlit import unlit
-
     traced, sizes = tracer(mesh), [m.roughness.shape for m in both[0]]
     options = RenderOptions(subsamples=SUBSAMPLES, gradients=False)
     renderer = MaterialRenderer(traced, captures, sizes, options)

@@ -11,6 +11,9 @@ from mistyle.core.camera import Camera, zoom
 from mistyle.core.image import luminance
 from mistyle.core.light import Directional, Lights, direction_in_world
 from mistyle.core.maps import place_of
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred import torch_bridge
+from mistyle.render.deferred.torch_bridge import Shader
 from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise.settings import FitSettings
 from mistyle.stylization.optimise.table import FitTable
@@ -135,8 +138,6 @@ class PhaseRunner:
         import torch
 
         from mistyle.measure.losses import crop_picture
-        from mistyle.render.deferred import integrator as deferred
-        from mistyle.render.deferred import torch_bridge
 
         size, count = self.settings.crop_size, self.settings.crops
         cameras = [zoom(self.scene.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in crops]
@@ -173,8 +174,6 @@ class PhaseRunner:
 
     def _light(self, surface: Any) -> "tuple[Any, torch.Tensor | None]":
         import torch
-
-        from mistyle.render.deferred import integrator as deferred
 
         beams = [light for light in self.phase.lights if isinstance(light, Directional)]
         if not self.phase.one_by_one:
@@ -227,8 +226,6 @@ def _mean_direction(beams: Sequence[Directional], camera: Camera) -> Float[np.nd
 
 def shader(settings: FitSettings, gloss: bool) -> Any:
     """The shader for one step's crops, stacked vertically."""
-    from mistyle.render.deferred.torch_bridge import Shader
-
     return Shader((settings.crops * settings.crop_size, settings.crop_size), gloss=gloss, bridge=settings.bridge)
 
 

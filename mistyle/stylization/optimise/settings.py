@@ -3,18 +3,17 @@
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from mistyle.core.settings import FrozenModel
 from mistyle.solver.settings import RecoverSettings
 
 # Of the solver of lit views. Stylized views are not measurements: fewer steps and samples than for photographs.
 ITERATIONS, BOUNCES, BOUNCE_SAMPLES, JOINT_SAMPLES = 640, 2, 32, 9
 
 
-class FitSettings(BaseModel):
+class FitSettings(FrozenModel):
     """Settings of the fit: the paper's values (4.2) where given, else values measured on real data."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     refine: Literal["auto", "off", "normal-roughness", "albedo", "all"] = Field(
         default="auto",

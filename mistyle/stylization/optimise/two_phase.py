@@ -23,7 +23,6 @@ Both phases are evaluated afterwards (`optimise/judge.py`), and undone where the
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,9 +32,11 @@ from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Lights, lights
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
+from mistyle.core.stage_progress import StageProgress
 from mistyle.core.view import View
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.stylization.optimise import judge as fit_judge
 from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise.phase import CropBatch, Loss, Phase, PhaseRunner, SceneContext
@@ -140,15 +141,10 @@ def two_phase(
                     evaluation = fit_judge.build_evaluation(scene.traced, scene.tangents, unlit)
             with memory.kept():
                 runner = PhaseRunner(scene, table, phase, settings, rng)
-                report = partial(_report, progress, done / total, phase.iterations / total)
-                fit = _one_phase(runner, fit, first, start.only, evaluation, report)
+                part = StageProgress(progress, done / total, (done + phase.iterations) / total)
+                fit = _one_phase(runner, fit, first, start.only, evaluation, part)
             done += phase.iterations
     return fit
-
-
-def _report(progress: Callable[[float], None], begin: float, length: float, done: float) -> None:
-    """Report progress within an interval of the total."""
-    progress(begin + length * done)
 
 
 def _one_phase(
@@ -240,7 +236,6 @@ def _pictures(targets: Sequence[View]) -> tuple[Any, ...]:
 
 def _scene(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> SceneContext:
     from mistyle.measure.features import load_features
-    from mistyle.render.mitsuba.draw import tracer
 
     return SceneContext(
         traced=tracer(mesh),

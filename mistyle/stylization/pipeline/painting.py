@@ -56,7 +56,7 @@ def paint(
     direction: DirectionConstraint | None = None,
 ) -> PaintedSurface:
     """Paint the surface with one picture; `content`: lightness of its own texture; `direction`: that of strokes."""
-    from mistyle.stylization.surface.surface_painter import solve_surface
+    from mistyle.stylization.surface.painter import solve_surface
 
     return solve_surface(
         asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, direction=direction
@@ -159,9 +159,8 @@ def _laid(
     """
     from mistyle.atlas.texels import pad_in_place, sharpen_in_place
     from mistyle.core.image import nearest_fill_in_place
+    from mistyle.stylization.surface import lookup
     from mistyle.stylization.surface.layers import PaintRelief, TexelBand, lay_relief, painted_mask, protected
-    from mistyle.stylization.surface.lookup import neighbours
-    from mistyle.stylization.surface.surface_painter import surface_colour, surface_relief
 
     texels, start, used = atlas.texels[part], atlas.start[part], any(strength)
     side, tangents = texel_side(asset, part, texels), corner_tangents(asset.mesh)
@@ -172,10 +171,10 @@ def _laid(
         for rows in pieces(at):
             mask = at[rows]
             place = texels.position[rows][mask], texels.normal[rows][mask]
-            near = neighbours(solution, *place)
-            albedo[rows][mask] = linear_from_srgb(surface_colour(solution, *place, footprint=side, near=near))
+            near = lookup.neighbours(solution, *place)
+            albedo[rows][mask] = linear_from_srgb(lookup.colour(solution, *place, footprint=side, near=near))
             if used:
-                relief = PaintRelief(*surface_relief(solution, *place, footprint=side, near=near))
+                relief = PaintRelief(*lookup.relief(solution, *place, footprint=side, near=near))
                 lay_relief(bent, TexelBand(texels, rows, mask), relief, *strength, asset.mesh, tangents)
     sharpen_in_place(albedo, texels)
     pad_in_place([albedo], texels, settings.atlas.padding)

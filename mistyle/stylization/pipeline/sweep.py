@@ -63,7 +63,7 @@ def refuse_unsupported(settings: Settings) -> None:
 def stylizer_of(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Stylizer:
     """The weight-free stylizer of views, ready to paint."""
     from mistyle.stylization.surface.layers import content, masked_style, painted_direction, scaled
-    from mistyle.stylization.surface.view_painter import stylizer
+    from mistyle.stylization.surface.painter import stylizer
 
     surface = scaled(settings.surface, asset, settings.paint.stroke_size)
     lightness = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None

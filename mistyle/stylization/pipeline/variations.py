@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.camera import rig
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.io.store.output import claim, replace_files
 from mistyle.jobs.progress import Progress
 from mistyle.stylization.pipeline.preview import ATLAS, lit_views, painted_maps, reduced, rows_of

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.render.mitsuba.device import dr
 from mistyle.stylization.surface.kernels import floats, whole
 
 PRIMES = (73856093, 19349663, 83492791)
@@ -82,8 +83,6 @@ def each_near(
 
     Where `inside` is false the row is invalid. Some rows belong to other cells; with few points some repeat.
     """
-    import drjit as dr
-
     scale = dr.opaque(dj.Float, float(np.float32(1 / grid.size)))
     base = [dj.Int(dr.floor(point[axis] * scale)) for axis in range(3)]
     mask = dr.opaque(dj.UInt, grid.mask)
@@ -114,8 +113,6 @@ def thin(dj: ModuleType, grid: PointGrid, radius: float) -> Bool[np.ndarray, " n
     Parallel rounds: a point that outranks all undecided neighbours stays, and its neighbours are removed. `radius` is
     at most the cells' size. The mask is in the input order.
     """
-    import drjit as dr
-
     fate = dr.zeros(dj.UInt, len(grid.row))
     limit = dr.opaque(dj.Float, float(radius) ** 2)
     open_ones = grid.row
@@ -132,7 +129,6 @@ def thin(dj: ModuleType, grid: PointGrid, radius: float) -> Bool[np.ndarray, " n
 
 def _fates(dj: ModuleType, grid: PointGrid, fate: Any, i: Any, limit: Any) -> Any:
     """The fates of the points in rows `i` after one more round; `limit` is the squared radius."""
-    import drjit as dr
 
     def number(bits: Any) -> Any:
         return dr.reinterpret_array(dj.UInt, bits)
@@ -163,8 +159,6 @@ def near(
     most: int,
 ) -> Int[np.ndarray, "n k"]:
     """Up to `most` points j with |p_j - p_i|^2 + (turning |n_j - n_i|)^2 < reach^2, padded with the own index."""
-    import drjit as dr
-
     count = len(positions)
     grid = point_grid(dj, positions, normals, reach)
     row = whole(dj, grid.row)

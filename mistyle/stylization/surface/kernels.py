@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.drjit_arrays import aligned
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.device import dr
 
 TURNED = np.uint32(1 << 31)  # bit of a table entry whose neighbour's picture is turned by 180 degrees
 PAGES = 4  # quarter turns of the picture
@@ -94,11 +96,11 @@ class Prices:
     limit: PatchSizeLimit | None = None
 
 
-def module(name: str) -> ModuleType:
-    """Dr.Jit's array module of that name: "llvm", "cuda" or "metal"."""
+def module(name: str = "") -> ModuleType:
+    """Dr.Jit's array module "llvm", "cuda" or "metal"; by default that of the Mitsuba variant in use."""
     import importlib
 
-    return importlib.import_module(f"drjit.{name}")
+    return importlib.import_module(f"drjit.{name or device.use().split('_')[0]}")
 
 
 def floats(dj: ModuleType, values: np.ndarray) -> Any:
@@ -139,8 +141,6 @@ def choose_neighbours(dj: ModuleType, frame: Frames, near: Int[np.ndarray, "n k"
 
     Nearest means smallest |p_j - p_i - h (dx t + dy s)|^2 + (3 h)^2 |n_j - n_i|^2; the first of equals is taken.
     """
-    import drjit as dr
-
     count, reach = near.shape
     candidates = whole(dj, near)
     i = dr.arange(dj.UInt, count)
@@ -182,8 +182,6 @@ def offsets(
 ) -> tuple[Bool[np.ndarray, "n 25"], Float[np.ndarray, "n 25 2"]]:
     """For every table entry: whether the neighbour's tangent is opposite, and the sample's position (x, y) in the
     neighbour's frame, in spacings, clamped to +-4."""
-    import drjit as dr
-
     entry = dr.arange(dj.UInt, neighbours.size)
     i, j = entry // 25, whole(dj, neighbours)
     step = dr.gather(dj.Array3f, frame.position, i) - dr.gather(dj.Array3f, frame.position, j)
@@ -200,8 +198,6 @@ def describe(dj: ModuleType, table: Tables, colour: Any, basis: Any, mean: Any) 
 
     `colour` flat (n 3); `basis` flat (25 3 16) and `mean` flat (25 3): grid position, channel, component.
     """
-    import drjit as dr
-
     i = dr.arange(dj.UInt, table.count)
     return _components(
         dj, table.count, lambda k: dr.gather(dj.UInt, table.neighbour, i * 25 + k) & ~TURNED, colour, basis, mean
@@ -210,8 +206,6 @@ def describe(dj: ModuleType, table: Tables, colour: Any, basis: Any, mean: Any) 
 
 def describe_pixels(dj: ModuleType, colour: Any, shapes: Int[np.ndarray, "4 2"], basis: Any, mean: Any) -> Any:
     """Patch components of every pixel of the four pages (height x width in `shapes`); invalid at a page's border."""
-    import drjit as dr
-
     area = int(shapes[0].prod())
     count = PAGES * area
     i = dr.arange(dj.Int, count)
@@ -226,7 +220,6 @@ def describe_pixels(dj: ModuleType, colour: Any, shapes: Int[np.ndarray, "4 2"],
 
 def _components(dj: ModuleType, count: int, member: Callable[[Any], Any], colour: Any, basis: Any, mean: Any) -> Any:
     """Sum over grid positions k and channels of (colour[member(k)] - mean[k]) basis[k], flat (count 16)."""
-    import drjit as dr
 
     def body(k: Any, *parts: Any) -> tuple[Any, ...]:
         c = dr.gather(dj.Array3f, colour, member(k)) - dr.gather(dj.Array3f, mean, k)
@@ -249,8 +242,6 @@ def _components(dj: ModuleType, count: int, member: Callable[[Any], Any], colour
 
 def vote(dj: ModuleType, table: Tables, exemplar: ExemplarArrays, field: FieldArrays) -> Any:
     """The colour of every sample, flat (n 3): the weighted mean of its 25 neighbours' patches at its position."""
-    import drjit as dr
-
     i = dr.arange(dj.UInt, table.count)
 
     def body(k: Any, total: Any, weights: Any) -> tuple[Any, ...]:
@@ -285,8 +276,6 @@ def continued(
     dj: ModuleType, table: Tables, exemplar: ExemplarArrays, field: FieldArrays, slot: Any
 ) -> tuple[Any, Any, Any]:
     """A sample's place (page, x, y) if it continues the picture of its neighbour in table entry `slot`."""
-    import drjit as dr
-
     entry = dr.gather(dj.UInt, table.neighbour, slot)
     j, turned = entry & ~TURNED, entry >= TURNED
     step = dr.gather(dj.Array2f, table.offset, slot)
@@ -310,8 +299,6 @@ def search(
 
     `also` is one more candidate per sample (from `exhaustive`). Returns costs and places.
     """
-    import drjit as dr
-
     i = dr.arange(dj.UInt, table.count)
     cost = _cost(dj, table, exemplar, field, targets, prices)
 
@@ -351,8 +338,6 @@ def _cost(
     prices: Prices,
 ) -> Callable[[Any, Any, Any], Any]:
     """The cost of a place (page, x, y), for all samples, with neighbours' places from `field`."""
-    import drjit as dr
-
     i = dr.arange(dj.UInt, table.count)
     target = _descriptor(dj, targets.descriptor, i, WIDTH)
     band_weight = dr.gather(dj.Float, targets.band_weight, i)
@@ -396,22 +381,16 @@ def _cost(
 
 def _inside(dj: ModuleType, exemplar: ExemplarArrays, page: Any, x: Any, y: Any) -> tuple[Any, Any]:
     """A place clamped so that its patch lies on the page."""
-    import drjit as dr
-
     width, height = dr.gather(dj.Float, exemplar.width, page), dr.gather(dj.Float, exemplar.height, page)
     return dr.clip(x, BORDER, width - 1 - BORDER), dr.clip(y, BORDER, height - 1 - BORDER)
 
 
 def _pixel_at(dj: ModuleType, exemplar: ExemplarArrays, page: Any, x: Any, y: Any) -> Any:
     """The flat index of the pixel nearest to a place."""
-    import drjit as dr
-
     row = dj.UInt(dr.gather(dj.Float, exemplar.width, page))
     return dr.gather(dj.UInt, exemplar.start, page) + dj.UInt(dr.round(y)) * row + dj.UInt(dr.round(x))
 
 
 def _descriptor(dj: ModuleType, values: Any, index: Any, width: int) -> list[Any]:
     """The first `width` entries of a descriptor, in groups of four."""
-    import drjit as dr
-
     return [dr.gather(dj.Array4f, values, index * (WIDTH // 4) + k) for k in range(width // 4)]

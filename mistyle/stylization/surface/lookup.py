@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.render.mitsuba.device import dr
 from mistyle.stylization.surface import kernels
 from mistyle.stylization.surface.exemplar import exemplar as style
 from mistyle.stylization.surface.exemplar import relief as reliefs
@@ -108,7 +109,6 @@ def colour(
     normals: Float[np.ndarray, "n 3"],
     *,
     footprint: float = 0.0,
-    device: str = "llvm",
     near: Neighbours | None = None,
 ) -> Float[np.ndarray, "n 3"]:
     """Encoded sRGB (0..1) at surface points with unit normals; `near` is `neighbours` of them, if known.
@@ -121,7 +121,7 @@ def colour(
     glazed = bool(surface.glaze.any())
     out = np.empty((len(positions), 3), np.float32)
     near = near or neighbours(surface, positions, normals)
-    for part, shown in looked_up(surface, positions, near, surface.painting, footprint, device):
+    for part, shown in looked_up(surface, positions, near, surface.painting, footprint):
         values = np.clip(shown[:, :3], 0, 1)
         if glazed:
             glaze = surface.glaze[near.index[part]] * near.weight[part]
@@ -136,7 +136,6 @@ def relief(
     normals: Float[np.ndarray, "n 3"],
     *,
     footprint: float = 0.0,
-    device: str = "llvm",
     near: Neighbours | None = None,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """The gradient of the painted height along the surface (world vectors, root mean square about 1), and the
@@ -146,7 +145,7 @@ def relief(
     picture = np.concatenate([own.slope, own.dull[..., None]], axis=2)
     gradient, dull = np.empty((len(positions), 3), np.float32), np.empty(len(positions), np.float32)
     near = near or neighbours(surface, positions, normals)
-    for part, values in looked_up(surface, positions, near, picture, footprint, device, slopes=True):
+    for part, values in looked_up(surface, positions, near, picture, footprint, slopes=True):
         gradient[part], dull[part] = values[:, :3], values[:, 3]
     return gradient, dull
 
@@ -173,7 +172,6 @@ def height(
     normals: Float[np.ndarray, "n 3"],
     *,
     footprint: float = 0.0,
-    device: str = "llvm",
 ) -> Float[np.ndarray, " n"]:
     """The painted height in working units whose gradient along the surface is that of `relief`, where one piece of the
     painting continues. Pieces meet with a step, as their pictures do."""
@@ -181,7 +179,7 @@ def height(
     picture = np.repeat(reliefs.relief(surface.painting).height[..., None], 3, axis=2)
     result = np.empty(len(positions), np.float32)
     near = neighbours(surface, positions, normals)
-    for part, values in looked_up(surface, positions, near, picture, footprint, device):
+    for part, values in looked_up(surface, positions, near, picture, footprint):
         result[part] = values[:, 0] * pixel
     return result
 
@@ -192,13 +190,12 @@ def looked_up(
     near: Neighbours,
     picture: Float[np.ndarray, "h w 3"],
     footprint: float,
-    device: str,
     *,
     slopes: bool = False,
 ) -> Iterator[tuple[slice, Float[np.ndarray, "m 4"]]]:
     """Samples of a picture of the painting's size at surface points, in chunks: points and values. With `slopes`, the
     first two channels are a vector along the picture's x and y."""
-    dj = kernels.module(device)
+    dj = kernels.module()
     pixel = surface.spacing / max(surface.scale)  # one pixel of the painting on the surface
     if footprint > pixel:
         picture = style.blurred(picture, 0.4 * footprint / pixel)
@@ -243,8 +240,6 @@ def blended(
 
 def on_canvas(dj: ModuleType, surface: PaintedSurface, picture: Float[np.ndarray, "h w 3"]) -> Canvas:
     """A painted surface on the device; `picture` has its painting's size. Scales are pixels per working unit."""
-    import drjit as dr
-
     scale = np.array(surface.scale) / surface.spacing
     return Canvas(
         position=kernels.floats(dj, surface.positions),
@@ -273,8 +268,6 @@ def paint(
     Coordinates are clamped to it. Returns three channels and 0; with `slopes` the first two as a world vector, and the
     third.
     """
-    import drjit as dr
-
     count, reach = index.shape
     samples, weights = kernels.whole(dj, index), kernels.floats(dj, weight)
     i = dr.arange(dj.UInt, count)

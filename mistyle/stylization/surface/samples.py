@@ -15,6 +15,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
 from mistyle.core.rows import distinct
 from mistyle.geometry.normals import crease_normals, same_points
+from mistyle.render.mitsuba.device import dr
 from mistyle.stylization.surface import cells, kernels
 
 OVERSAMPLING = 5  # candidates per requested sample
@@ -66,9 +67,7 @@ def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
 
 def workers() -> int:
     """Threads for k-d trees, as many as Dr.Jit uses, so that one setting controls both; results do not depend on it."""
-    import drjit
-
-    return max(int(drjit.thread_count()), 1)
+    return max(int(dr.thread_count()), 1)
 
 
 def sample_normals(mesh: Mesh) -> Float[np.ndarray, "f 3 3"]:

@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from mistyle.core.settings import FrozenModel
 
 
-class PlainSettings(BaseModel):
+class PlainSettings(FrozenModel):
     """Settings of the embedded stylizer that do not depend on the painting."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     samples: int = Field(default=250_000, ge=500, le=4_000_000, description="surface samples of the finest level")
     stroke_scale: float = Field(
@@ -160,10 +160,8 @@ class ResolvedSettings(PlainSettings):
     omit: Boxes
 
 
-class PaintSettings(BaseModel):
+class PaintSettings(FrozenModel):
     """Placement of pictures, protected areas, stroke size, relief and gloss."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     slots: tuple[str, ...] = Field(
         default=(),

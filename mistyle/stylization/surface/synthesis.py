@@ -109,7 +109,6 @@ def solve(
     settings: SurfaceSettings | ResolvedSettings,
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
-    device: str = "llvm",
 ) -> PaintedSurface:
     """Paint `mesh` in the style of a picture; transparent parts of the picture are not used.
 
@@ -117,7 +116,7 @@ def solve(
     samples take about 20 CPU seconds and 0.9 GB. Raises InputRefused for a mesh without area and for an unusable
     picture. It copies pieces of the picture: recognisable objects in it (a star, an eye) may appear on the surface.
     """
-    dj = kernels.module(device)
+    dj = kernels.module()
     base = mesh_guides(mesh, picture, fields, settings, seed, dj, lambda done: progress(0.25 * done))
     progress(0.35)
     field, exemplar = synthesise(base, seed, dj, lambda done: progress(0.35 + 0.65 * done))

@@ -45,14 +45,12 @@ class ViewLevel:
     side: int
 
 
-def paint_view(
-    view: View, prior: Prior | None, base: MeshGuides, seed: int, device: str = "llvm"
-) -> Float[np.ndarray, "h w 3"]:
+def paint_view(view: View, prior: Prior | None, base: MeshGuides, seed: int) -> Float[np.ndarray, "h w 3"]:
     """Encoded sRGB (0..1) of the view's foreground, zero elsewhere.
 
     The prior's known colours stay. The rest is painted to continue them, together with a margin of known pixels.
     """
-    dj = kernels.module(device)
+    dj = kernels.module()
     result = np.zeros(view.rgb.shape, np.float32)
     active = view.mask if prior is None else beside_unknown(view, prior, MARGIN * finest_side(view, base))
     if not active.any():
@@ -66,7 +64,7 @@ def paint_view(
     pixels = np.flatnonzero(active)
     positions = flat_positions(view, pixels)
     normals = np.broadcast_to(TOWARDS, positions.shape)
-    result.reshape(-1, 3)[pixels] = lookup.colour(surface, positions, normals, footprint=1.0, device=device)
+    result.reshape(-1, 3)[pixels] = lookup.colour(surface, positions, normals, footprint=1.0)
     return result if prior is None else joined(result, prior, view.mask)
 
 

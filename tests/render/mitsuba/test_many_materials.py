@@ -16,7 +16,7 @@ from mistyle.core.camera import rig
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.paths import scenes
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.io.read_mesh import read_extent, read_mesh
 from mistyle.jobs import memory_budget as budget
 from mistyle.jobs.progress import Progress

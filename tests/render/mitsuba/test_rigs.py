@@ -9,7 +9,7 @@ import trimesh
 from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.geometry import next_best_view as rigs
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.render.mitsuba.rigs import next_best_views, sample_surface

@@ -59,7 +59,7 @@ def test_the_picture_loss_is_the_noise_loss_times_its_weight(pipeline, offset, l
     zt = consislora.noisy(z0, noise, alpha)
     predicted = (zt - (1 - alpha).sqrt() * eps) / alpha.sqrt()
     # In double the identity holds to rounding; x0_loss itself takes the network's float32 answer.
-    exact = torch.mean((eps - noise) ** 2) * consislora.weight(alpha)
+    exact = torch.mean((eps - noise) ** 2) * ((1 - alpha) / alpha)
     assert torch.mean((predicted - z0) ** 2) == pytest.approx(float(exact), rel=1e-12)
     ours = consislora.x0_loss(eps.float(), z0.float(), zt.float(), alpha.float())
     assert float(ours) == pytest.approx(float(exact), rel=2e-3 if level == 0 else 1e-5)
@@ -67,7 +67,7 @@ def test_the_picture_loss_is_the_noise_loss_times_its_weight(pipeline, offset, l
 
 def test_weights_are_those_of_sdxl(pipeline):
     alphas = pipeline.scheduler.alphas_cumprod
-    found = [float(consislora.weight(alphas[t])) for t in (100, 500, 700, 900, 999)]
+    found = [float((1 - alphas[t]) / alphas[t]) for t in (100, 500, 700, 900, 999)]
     assert found == pytest.approx([0.118, 2.6, 11.1, 70, 214], rel=0.03)
 
 
@@ -165,7 +165,7 @@ def test_the_switch_replaces_or_adds(pipeline, halves, picture, mode):
 
     (before, error), (after, _) = at(SETTINGS.switch - 1), at(SETTINGS.switch)
     assert float(before) == error
-    factor = float(consislora.weight(alpha)) + (mode == "sum")
+    factor = float((1 - alpha) / alpha) + (mode == "sum")
     assert float(after) == pytest.approx(error * factor, rel=1e-4)
 
 

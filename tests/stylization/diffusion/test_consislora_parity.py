@@ -99,7 +99,7 @@ def test_velocity_networks_learn_the_same_picture():
         zt = consislora.noisy(z0, noise, alpha)
         eps = noise + error
         v = (eps - (1 - alpha).sqrt() * zt) / alpha.sqrt()
-        exact = consislora.weight(alpha) * torch.mean(error**2)
+        exact = ((1 - alpha) / alpha) * torch.mean(error**2)
         assert float(consislora.x0_loss(v, z0, zt, alpha, "v_prediction")) == pytest.approx(float(exact), rel=1e-4)
         wanted = consislora.velocity(z0, noise, alpha)
         assert float(torch.mean((v - wanted) ** 2)) == pytest.approx(float(torch.mean(error**2) / alpha), rel=1e-9)

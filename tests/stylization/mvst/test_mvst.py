@@ -6,7 +6,7 @@ from test_warp import BALL, at, colours, see
 
 from mistyle.core.camera import angular_order, rig
 from mistyle.core.image import erode, match_histogram, overlap, srgb_from_linear
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import Prior, View
 from mistyle.stylization.mvst.settings import SweepSettings
 from mistyle.stylization.mvst.sweep import PaintedView, ViewPainter, ViewStore, sweep, towards, visiting

@@ -12,7 +12,7 @@ from mistyle.core.camera import rig
 from mistyle.core.image import gaussian, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Directional
 from mistyle.core.maps import Maps, Texels, flat_maps
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import torch_bridge

@@ -13,7 +13,7 @@ from mistyle.core.camera import rig
 from mistyle.core.image import gaussian, srgb_from_linear
 from mistyle.core.light import Directional
 from mistyle.core.maps import flat_maps
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
 from mistyle.render.mitsuba import device, draw
 from mistyle.stylization.optimise import phase as fit_run

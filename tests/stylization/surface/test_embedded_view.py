@@ -49,7 +49,7 @@ def strokes(rng: np.random.Generator) -> np.ndarray:
 @pytest.fixture(scope="module")
 def paint():
     """The stylizer of the ball."""
-    from mistyle.stylization.surface.view_painter import stylizer
+    from mistyle.stylization.surface.painter import stylizer
 
     style = Picture(strokes(np.random.default_rng(0)), None, Path("strokes.png"))
     return stylizer(ball_mesh(), style, SETTINGS, 0)
@@ -186,7 +186,7 @@ def by_view(inputs, out, **more) -> Job:
 
 def test_the_job_with_this_stylizer_and_its_resumption(inputs, tmp_path, monkeypatch):
     """Killed in the fourth view, run again: only the rest is painted, and every file ends with the same bytes."""
-    from mistyle.stylization.surface import view_painter as embedded_view
+    from mistyle.stylization.surface import painter as embedded_view
 
     pipeline.stylize(by_view(inputs, tmp_path / "whole"), Progress(quiet=True))
     painted = []

@@ -13,8 +13,7 @@ from mistyle.core.asset import Picture
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.io.store.records import load_record, save_record
-from mistyle.render.mitsuba import device
-from mistyle.render.mitsuba.occlusion import ambient_occlusion
+from mistyle.render.mitsuba import device, occlusion
 from mistyle.stylization.surface import field, kernels, lookup, samples, synthesis
 from mistyle.stylization.surface.exemplar import exemplar as style
 from mistyle.stylization.surface.guides import creases, guides, linefield
@@ -617,21 +616,21 @@ def test_occlusion_has_its_closed_forms():
         np.array([[0.0, -0.499, 0.0], [0.0, 0.5, 0.0]], np.float32),
         np.tile(np.array([0.0, 1, 0], np.float32), (2, 1)),
     )
-    got = ambient_occlusion(open_box, p, n, rays=4096, distance=10)
+    got = occlusion.open_sky(open_box, p, n, rays=4096, distance=10)[:, 3]
     half = 0.5 / (0.999 - 0.002)  # half the side over the height left after the rays' lift
     corner = half / np.sqrt(1 + half**2) * np.arctan(half / np.sqrt(1 + half**2)) / np.pi
     assert got[0] == pytest.approx(4 * corner, abs=0.01)  # 4096 rays of a lattice: better than 1 / sqrt(4096)
     assert got[1] == 1.0
-    assert ambient_occlusion(open_box, p, n, rays=64, distance=0.3)[0] == 1.0  # nothing within reach
-    again = ambient_occlusion(open_box, p, n, seed=7)
-    assert (again == ambient_occlusion(open_box, p, n, seed=7)).all()
+    assert occlusion.open_sky(open_box, p, n, rays=64, distance=0.3)[0, 3] == 1.0  # nothing within reach
+    again = occlusion.open_sky(open_box, p, n, seed=7)
+    assert (again == occlusion.open_sky(open_box, p, n, seed=7)).all()
 
 
 def test_a_real_pair_shows_palette_strokes_and_form():
     import trimesh
 
     from mistyle.core.asset import Picture
-    from mistyle.stylization.surface.surface_painter import solve_surface, surface_colour
+    from mistyle.stylization.surface.painter import solve_surface
 
     loaded = trimesh.load(data("meshes/plain/spot.obj"), force="mesh")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
@@ -641,7 +640,7 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     path = data("styles/starry_night.jpg")
     picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(np.float32) / 255
     solution = solve_surface(mesh, Picture(picture, None, path), SurfaceSettings(samples=15_000), 0)
-    colour = style.lab_from_srgb(surface_colour(solution, solution.positions, solution.normals)[None])[0]
+    colour = style.lab_from_srgb(lookup.colour(solution, solution.positions, solution.normals)[None])[0]
     reference = style.lab_from_srgb(style.resized(solution.painting, (102, 128))).reshape(-1, 3)
     # The palette: mean colour and spread within a fifth of the painting's lightness range.
     np.testing.assert_allclose(colour.mean(axis=0), reference.mean(axis=0), atol=0.1)
@@ -650,7 +649,7 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     light = style.lab_from_srgb(solution.painting)[..., 0]
     pixel = solution.spacing / max(solution.scale) * solution.tangent
     places = solution.positions + np.random.default_rng(0).random((len(colour), 1), np.float32) * pixel
-    one, other = (surface_colour(solution, p, solution.normals) for p in (places, places + pixel))
+    one, other = (lookup.colour(solution, p, solution.normals) for p in (places, places + pixel))
     one, other = (style.lab_from_srgb(c[None])[0, :, 0] for c in (one, other))
     assert 0.6 < np.abs(one - other).mean() / np.abs(np.diff(light, axis=1)).mean() < 1.1
     # And neighbouring samples as pixels that far apart.

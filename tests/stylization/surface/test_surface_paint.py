@@ -19,7 +19,7 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import bilinear
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import face_areas
-from mistyle.core.rig_settings import RigSettings
+from mistyle.core.settings import RigSettings
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.io.images.write import write_png
 from mistyle.render.mitsuba.draw import gbuffer, tracer

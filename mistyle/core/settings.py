@@ -1,4 +1,4 @@
-"""Settings of the cameras of the views."""
+"""The base of all records that users write (settings, jobs, sheets), and the settings of the views' cameras."""
 
 from pathlib import Path
 from typing import Literal
@@ -6,10 +6,14 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 
-class RigSettings(BaseModel):
-    """Camera positions of the views (paper 4.1.1)."""
+class FrozenModel(BaseModel):
+    """Read once and never changed; unknown names are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class RigSettings(FrozenModel):
+    """Camera positions of the views (paper 4.1.1)."""
 
     kind: Literal["paper", "turntable", "nbv", "file"] = Field(
         default="paper", description="'nbv': as few views as the mesh needs (next best view)"
