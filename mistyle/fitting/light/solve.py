@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.fitting.light.cells import LightCells, Radiance
 from mistyle.render.deferred.material_table import ALBEDO, ROUGHNESS, TILT
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.solver.photometry.material import NOISY, MaterialSamples, corrected_samples, gain_prior, gain_terms
+from mistyle.solver.photometry.material import MaterialSamples, corrected_samples, gain_prior, gain_terms
 from mistyle.solver.photometry.record import Gains
 from mistyle.solver.prior import LEAST_SEEN
 from mistyle.solver.texels.gbuffer import open_sky
@@ -34,9 +34,7 @@ from mistyle.solver.texels.observations import TexelObservations
 # set the scale and the colour of the light.
 MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.6, 0.0)
 SPREAD = (10.0, 10.0, 10.0, 0.1, 0.1, 0.3, 0.1)
-# Standard deviations of a small picture's pixel at known exposures, absolute and relative: the model is coarse.
-NOISE = 0.002, 0.015
-SMOOTH = 4.5e-5  # weight of neighbouring cells' squared relative difference, over the pixels' squared relative noise
+SMOOTH = 0.05  # weight of the squared relative difference between neighbouring cells
 FLAT = 0.05  # floor of the brightness that scales differences, as a share of the mean radiance
 STEP = 0.01  # of finite differences by tilt, roughness and metallic
 BLOCK = 1024  # texels per batch
@@ -76,11 +74,6 @@ class Bundle:
         """Unknowns of a channel beside the cells' radiances: gains and vignetting."""
         return 0 if self.samples is None else self.samples.pictures + 3
 
-    @property
-    def smooth(self) -> float:
-        """Weight of the squared relative difference between neighbouring cells."""
-        return SMOOTH / noise_of(self.samples is not None)[1] ** 2
-
 
 @dataclass(frozen=True)
 class State:
@@ -92,11 +85,6 @@ class State:
     cost: float
     residual: float
     gains: Gains | None = None
-
-
-def noise_of(solved: bool) -> tuple[float, float]:
-    """Standard deviations of a small picture's pixel; `solved` where exposures are."""
-    return NOISY if solved else NOISE
 
 
 def bundle(
@@ -161,7 +149,7 @@ def light_over(bundled: Bundle, radiance: Radiance, values: Values, gains: Gains
     matrix, gradient = _system(bundled, at, follow=False)
     flat = radiance.T.ravel()
     damping = 1e-3 * np.diag(np.diag(matrix))
-    full = matrix + damping + _smoothness(bundled, radiance)
+    full = matrix + damping + _smoothness(bundled.cells, radiance)
     return _least_squares(full, gradient + (matrix + damping) @ flat, radiance)[0]
 
 
@@ -180,7 +168,7 @@ def solve_light_and_texels(
     more = bundled.more
     for _ in range(steps):
         matrix, gradient = _system(bundled, state, follow=True)
-        smooth, flat = _smoothness(bundled, state.radiance, more), _flat(state.radiance, more)
+        smooth, flat = _smoothness(bundled.cells, state.radiance, more), _flat(state.radiance, more)
         means = _means(bundled.cells, convention(bundled, state), more)
         held, pull = _held(bundled, state)
 
@@ -317,14 +305,13 @@ def _schur_terms(
     return schur, slope
 
 
-def _smoothness(bundled: Bundle, radiance: Radiance, more: int = 0) -> Float[np.ndarray, "n n"]:
+def _smoothness(cells: LightCells, radiance: Radiance, more: int = 0) -> Float[np.ndarray, "n n"]:
     """Quadratic form of neighbours' squared differences relative to their brightness: lamps may have sharp edges.
     `more` unknowns of each channel, after its radiances, are free."""
-    cells, bright = bundled.cells, radiance.mean(axis=1)
-    count = len(cells.angle) + more
+    bright, count = radiance.mean(axis=1), len(cells.angle) + more
     i, j = cells.pairs.T
     flat = FLAT * float((bright * cells.angle).sum() / cells.angle.sum())
-    weight = bundled.smooth / np.maximum((bright[i] + bright[j]) / 2 + flat, 1e-12) ** 2
+    weight = SMOOTH / np.maximum((bright[i] + bright[j]) / 2 + flat, 1e-12) ** 2
     one = np.zeros((count, count))
     for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
         np.add.at(one, (a, b), sign * weight)

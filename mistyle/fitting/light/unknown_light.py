@@ -31,7 +31,7 @@ from mistyle.fitting.light.texel_prior import first_mean, metals, with_common_ro
 from mistyle.render.deferred.material_table import ALBEDO
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver import prior as recover_prior
-from mistyle.solver.photometry.material import all_samples
+from mistyle.solver.photometry.material import NOISY, all_samples
 from mistyle.solver.photometry.record import Gains
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import Atlas, atlas_of, linked, scatter, scatter_to_atlas
@@ -44,6 +44,7 @@ OBSERVATIONS = 30_000  # target number of observations; the time is proportional
 STEPS = (10, 12)  # joint steps with even cells, and with finer ones
 CLASSINGS = 3  # most decisions which texels are metal, each with joint steps after it
 SAME = 0.99  # share of equal classes that ends them
+NOISE, RELATIVE = 0.01, 0.03  # standard deviation of a small picture's pixels: the model is coarse
 FLOOR = 0.1  # least roughness; smaller values give highlights narrower than the finest cells
 
 
@@ -100,7 +101,7 @@ def find_light(
 
     traced = tracer(mesh)
     chosen = np.array(evenly(len(captures), PICTURES))
-    noise = light_solve.noise_of(gains is not None)
+    noise = (NOISE, RELATIVE) if gains is None else NOISY
     cameras, texels, observed = _observations(traced, captures, settings, chosen, noise)
     samples = None if gains is None else all_samples(observed, cameras, noise)
     own = None if gains is None else Gains(gains.gain[chosen], gains.vignetting)
