@@ -185,11 +185,13 @@ def with_triangle(own: Float[np.ndarray, "h w"], camera: Camera, drawing: Drawin
 def write_sheet(path: Path, before: Mesh, after: Mesh, view: View) -> None:
     """The mesh before and after from the view and from the side, and the drawn outline."""
     from mistyle.io.images.write import write_png
-    from mistyle.stylization.displace.pictures import cameras_of, under_key, with_positions
+    from mistyle.solver.shape.moved import turned_normals
+    from mistyle.stylization.displace.pictures import cameras_of, under_key
 
     cameras = cameras_of([view.camera], 400)
+    moved = replace(before, positions=after.positions, corner_normals=turned_normals(before, after.positions))
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [under_key(before, cameras, 0), under_key(with_positions(before, after.positions), cameras, 0)]
+    rows = [under_key(before, cameras, 0), under_key(moved, cameras, 0)]
     outline = cv2.resize(1 - view.coverage, (400, 400), interpolation=cv2.INTER_AREA)
     outlines = [np.repeat(outline[..., None], 3, axis=2)] * 2
     write_png(path, np.concatenate([np.concatenate(pair, axis=1) for pair in zip(rows, outlines, strict=True)]))

@@ -25,6 +25,7 @@ from mistyle.fitting.settings.material import MaterialSettings, ReferenceSetting
 from mistyle.io.cameras.views import read_views, write_views
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
+from mistyle.jobs import plan as jobs_plan
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report.charts import Chart, svg
 from mistyle.render.deferred.material_table import pack
@@ -207,7 +208,8 @@ def test_a_second_run_takes_everything_over(fitted, shots):
     assert not list((out / "work").glob("checkpoint-*"))
 
 
-def test_a_dry_run_counts_and_makes_nothing(shots, tmp_path, capsys):
+def test_a_dry_run_counts_and_makes_nothing(shots, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(jobs_plan, "slowness", lambda threads: threads / 2)
     words = ["fit", str(shots / "bowl.obj"), str(shots / "shots"), "-o", str(tmp_path / "out"), "--dry-run"]
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -190,7 +190,7 @@ def test_relief_turns_as_the_picture_does(dj, turn):  # noqa: F811
 
     def shown(picture, where, slopes=False):
         near = lookup.neighbours(solution, where, up)
-        return next(iter(lookup.looked_up(solution, where, near, picture, 0.0, "llvm", slopes=slopes)))[1][0]
+        return next(iter(lookup.looked_up(solution, where, near, picture, 0.0, slopes=slopes)))[1][0]
 
     gradient = shown(constant, at, slopes=True)
     assert gradient[3] == pytest.approx(0.25, abs=1e-6)
