@@ -76,9 +76,11 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         if reached.done < reached.planned and time.monotonic() - since >= OFTEN * (written[0] - since):
             write_reached(reached, smooth=True)
 
-    visible = visible_shares(surface_of(asset.mesh.positions, asset.mesh.faces), captures.cameras, captures.lights)
-    closing = closing_seconds(s, pixels_of(captures), texels, has_soft(captures.lights), visible)
-    deadline = since + 60 * s.minutes - closing if s.minutes else float("inf")
+    deadline = float("inf")
+    if s.minutes:
+        visible = visible_shares(surface_of(asset.mesh.positions, asset.mesh.faces), captures.cameras, captures.lights)
+        closing = closing_seconds(s, pixels_of(captures), texels, has_soft(captures.lights), visible)
+        deadline = since + 60 * s.minutes - closing
     checkpoints = Checkpoints(
         lambda arrays: checkpoint.save(folder, arrays), checkpoint.load(folder, run.progress.note)
     )
