@@ -93,7 +93,8 @@ def _exr(path: Path) -> None:
 
 
 def _captures(path: Path) -> None:
-    from mistyle.io.cameras.captures import read_captures, sparse_points
+    from mistyle.io.cameras.captures import read_captures
+    from mistyle.io.cameras.sparse_points import sparse_points
 
     found = read_captures(path, lights="unknown")
     for k in range(len(found)):
@@ -102,10 +103,10 @@ def _captures(path: Path) -> None:
 
 
 def _colmap(path: Path) -> None:
-    from mistyle.io.read import read_colmap, read_colmap_points
+    from mistyle.io.read import read_colmap, read_points
 
     read_colmap(path)
-    read_colmap_points(path)
+    read_points(path)
 
 
 def _settings(path: Path) -> None:

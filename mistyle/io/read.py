@@ -24,7 +24,6 @@ __all__ = [
     "LayeredPicture",
     "Picture",
     "read_colmap",
-    "read_colmap_points",
     "read_exposure",
     "read_exr",
     "read_frame",
@@ -33,6 +32,7 @@ __all__ = [
     "read_metashape",
     "read_npy",
     "read_picture",
+    "read_points",
     "read_radiance",
     "read_raw",
     "read_realityscan",
@@ -153,6 +153,6 @@ def read_realityscan(path: Path) -> list[Any]:
     return ask("realityscan", Path(path))
 
 
-def read_colmap_points(folder: Path) -> Any:
-    """The points of a COLMAP model (io/cameras/colmap.py SparsePoints), or None where it has no points3D file."""
-    return ask("colmap_points", Path(folder))
+def read_points(path: Path) -> Any:
+    """The points (n, 3) of a PLY, or of the folder of a COLMAP model; None where that has no points3D file."""
+    return ask("points", Path(path))

@@ -29,12 +29,13 @@ from mistyle.fitting.light import solve as light_solve
 from mistyle.fitting.light.solve import Bundle, State
 from mistyle.fitting.light.texel_prior import first_mean, metals, with_common_roughness, with_metals
 from mistyle.render.deferred.material_table import ALBEDO
-from mistyle.render.mitsuba.draw import Tracer
+from mistyle.render.mitsuba.draw import Tracer, tracer
 from mistyle.solver import prior as recover_prior
 from mistyle.solver.photometry.material import NOISY, all_samples
 from mistyle.solver.photometry.record import Gains
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import Atlas, atlas_of, linked, scatter, scatter_to_atlas
+from mistyle.solver.texels.levenberg_marquardt import Options
 from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, coarse_observations
 
 SIDE = 192  # pixels along the longer side of the small pictures
@@ -96,9 +97,6 @@ def find_light(
     Direct light and shadows are modelled, interreflection is not: on concave surfaces the light comes out too bright.
     Raises InputRefused where no texel is seen.
     """
-    from mistyle.render.mitsuba.draw import tracer
-    from mistyle.solver.texels.levenberg_marquardt import Options
-
     traced = tracer(mesh)
     chosen = np.array(evenly(len(captures), PICTURES))
     noise = (NOISE, RELATIVE) if gains is None else NOISY

@@ -96,7 +96,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 
     Raises a MistyleError for every error that a user can fix; finished stages stay.
     """
-    from mistyle.deliver.colour import in_working_space, key_of
+    from mistyle.deliver.colour import in_working_space
     from mistyle.deliver.export import check, deliver
     from mistyle.fitting.report.material import material_report, write_summary
     from mistyle.io.cameras.captures import read_shots
@@ -112,7 +112,6 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     check_material(needed, pixels_of(captures))
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
     captures = in_working_space(captures, shots, s.colour)
-    pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
     files_at = job.out / "work" if in_files(needed, pixels_of(captures)) else None
     with Run(job, progress, MATERIAL_STAGES) as run, memory.within(1e9 * allowed(s).gb, files_at):
         start_engines(s)
@@ -121,10 +120,8 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         )
         check_material(needed, pixels_of(captures), *size_of(asset))
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
-        read_as = [shot.pixels for shot in shots]
-        key_inputs = [pictures, read_as, [vars(c) for c in captures.cameras], captures.lights]
-        key_inputs += [s.references, s.seed, key_of(s.colour)]
-        placed = run.record("cameras", ["mesh"], key_inputs, lambda r: place(job, asset, captures, shots, r))
+        seen = camera_inputs(job, captures, shots)
+        placed = run.record("cameras", ["mesh"], seen, lambda r: place(job, asset, captures, shots, r))
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
@@ -150,6 +147,18 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             inputs = [s.report, job.name]
             run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, results, progress, r))
         return deliver(job, progress) | write_summary(results, run)
+
+
+def camera_inputs(job: MaterialJob, captures: Captures, shots: Sequence[Any]) -> list[Any]:
+    """What the placed cameras and the pictures depend on, beside the mesh."""
+    from mistyle.deliver.colour import key_of
+    from mistyle.io.cameras.sparse_points import sparse_points
+
+    s = job.settings
+    pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
+    points = sparse_points(job.references) if s.references.align else None
+    seen_as = [[shot.pixels for shot in shots], [vars(c) for c in captures.cameras], captures.lights]
+    return [pictures, *seen_as, points, s.references, s.seed, key_of(s.colour)]
 
 
 def explained_pictures(
@@ -213,9 +222,10 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
 def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Placed:
     """The cameras in working space: unchanged, converted from the mesh's units, or aligned and refined on request; and
     the overlap of the mesh's outlines with the masks."""
-    from mistyle.geometry.similarity import moved, upright
-    from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
+    from mistyle.geometry.similarity import Y_FROM_Z, moved, upright
+    from mistyle.io.cameras.captures import camera_space, outline_of, silhouette
     from mistyle.io.cameras.reading_notes import matte_note
+    from mistyle.io.cameras.sparse_points import sparse_points
     from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
     from mistyle.solver.cameras.outline_check import check_outlines, overlap_notes
 
@@ -231,11 +241,12 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
         except InputRefused:
             if sparse is None or chosen.refine_poses or job.masks is not None:
                 raise
-            notes.append("The pictures have no masks: the mesh was aligned to the model's points alone.")
+            notes.append("The pictures have no masks: the mesh was aligned to the reconstruction's points alone.")
     if chosen.align:
         rng = np.random.default_rng(job.settings.seed)
         if sparse is not None:
-            aligned = align_by_points(asset.mesh, sparse.position, captures.cameras, masks, rng)
+            points = sparse @ Y_FROM_Z.T if chosen.up == "z" else sparse
+            aligned = align_by_points(asset.mesh, points, captures.cameras, masks, rng)
         else:
             aligned = align_by_masks(asset.mesh, captures.cameras, masks or (), rng)
         captures = moved(captures, aligned.work_from_cams)

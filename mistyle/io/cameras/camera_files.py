@@ -184,7 +184,7 @@ def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[C
     are not rigid motions.
     """
     tree = read_json(path)
-    original = np.linalg.inv(_applied(tree, path))
+    original = np.linalg.inv(applied_transform(tree, path))
     try:
         known = [_Frame.model_validate(frame) for frame in _Transforms.model_validate(tree).frames]
         names = unique_names([frame.file_path or f"view_{k:03d}" for k, frame in enumerate(known)])
@@ -220,7 +220,7 @@ def _fields(tree: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]
     return {**{key: value for key, value in tree.items() if not (own and key in kinds)}, **frame}
 
 
-def _applied(tree: Mapping[str, Any], path: Path) -> Float[np.ndarray, "4 4"]:
+def applied_transform(tree: Mapping[str, Any], path: Path) -> Float[np.ndarray, "4 4"]:
     """nerfstudio's transform of the space of the reconstruction: a similarity, by default the identity."""
     matrix = tree.get("applied_transform")
     scale = tree.get("applied_scale", 1.0)

@@ -36,7 +36,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, lights_of_views
 from mistyle.geometry.lens import Lens, pinhole, resample
 from mistyle.io.cameras.camera_files import PIXELS, SPACE, CameraFrame, ViewEntry, read_entries, read_frames
-from mistyle.io.cameras.colmap import SparsePoints, find_model
+from mistyle.io.cameras.colmap import find_model
 from mistyle.io.cameras.foreign import foreign_files, foreign_kind
 from mistyle.io.cameras.picture_files import (
     ADD,
@@ -56,7 +56,6 @@ from mistyle.io.cameras.views import picture_of_view
 from mistyle.io.images.quantisation import fractions, linear_rows
 from mistyle.io.read import (
     read_colmap,
-    read_colmap_points,
     read_exr,
     read_json,
     read_metashape,
@@ -208,12 +207,6 @@ def camera_space(path: Path) -> Literal["working", "own"]:
     kind, file = source_of(Path(path))
     ours = kind == "camera.json" or (kind == "transforms" and read_json(file).get("space") == SPACE)
     return "working" if ours else "own"
-
-
-def sparse_points(path: Path) -> SparsePoints | None:
-    """The points of a COLMAP model, in the cameras' space; None for other references."""
-    kind, file = source_of(Path(path))
-    return read_colmap_points(file) if kind == "colmap" else None
 
 
 def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = WHOLE) -> Loaded:

@@ -7,11 +7,10 @@ COLMAP's conventions are ours: camera axes x right, y down, z forward; x_cam = R
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mistyle.geometry.lens import Lens
 from mistyle.geometry.similarity import similarity
@@ -29,15 +28,6 @@ MAX_IMAGES = 4096
 FILES = ("cameras", "images")
 UNDISTORT = "Run `colmap image_undistorter` and hand in its output"
 AGAIN = "Export the model again (`colmap model_converter`)"
-
-
-@dataclass(frozen=True)
-class SparsePoints:
-    """The points of a model: position (the model's units), mean reprojection error (pixels), number of observations."""
-
-    position: Float[np.ndarray, "n 3"]
-    error: Float[np.ndarray, " n"]
-    seen: Int[np.ndarray, " n"]
 
 
 def find_model(path: Path) -> Path | None:
@@ -97,16 +87,16 @@ def read_model(folder: Path) -> list[CameraFrame]:
     return frames
 
 
-def read_points(folder: Path) -> SparsePoints | None:
-    """The points of a model, or None where it has no points3D file."""
+def read_points(folder: Path) -> Float[np.ndarray, "n 3"] | None:
+    """The points of a model (the model's units), or None where it has no points3D file."""
     files = [path for ending in (".bin", ".txt") if (path := folder / f"points3D{ending}").is_file()]
     if not files:
         return None
     rows = _guarded(_points_bin if files[0].suffix == ".bin" else _points_txt, files[0])
-    table = np.asarray(rows, float).reshape(-1, 5)
-    if not np.isfinite(table[:, :3]).all():
+    points = np.asarray(rows, float).reshape(-1, 3)
+    if not np.isfinite(points).all():
         raise refuse(files[0], "points at NaN or infinity", "finite points", AGAIN)
-    return SparsePoints(table[:, :3], table[:, 3], table[:, 4].astype(np.int64))
+    return points
 
 
 def _file(folder: Path, name: str) -> tuple[Path, bool]:
@@ -206,8 +196,8 @@ def _points_bin(path: Path) -> list[tuple[float, ...]]:
     head = _Bytes(path)
     rows = []
     for _ in range(head.take("Q")[0]):
-        _, x, y, z, _, _, _, error, seen = head.take("Q3d3BdQ")
-        rows.append((x, y, z, error, seen))
+        _, x, y, z, _, _, _, _, seen = head.take("Q3d3BdQ")
+        rows.append((x, y, z))
         head.skip(8 * seen)
     return rows
 
@@ -260,6 +250,6 @@ def _points_txt(path: Path) -> list[tuple[float, ...]]:
     for line in _lines(path):
         if line.strip():
             fields = line.split()
-            x, y, z, error = (float(fields[k]) for k in (1, 2, 3, 7))
-            rows.append((x, y, z, error, (len(fields) - 8) // 2))
+            x, y, z, _ = (float(fields[k]) for k in (1, 2, 3, 7))
+            rows.append((x, y, z))
     return rows

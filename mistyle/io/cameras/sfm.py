@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import BaseModel, Field, ValidationError
 
 from mistyle.core.errors import InputRefused
@@ -101,6 +102,16 @@ def read_sfm(path: Path) -> list[CameraFrame]:
         check_rotation(world_from_cam[:3, :3], where, path)
         frames.append(CameraFrame(name, view.path, None, world_from_cam, lens, "stored"))
     return frames
+
+
+def read_landmarks(path: Path) -> Float[np.ndarray, "n 3"]:
+    """The points of the reconstruction, as many as the file holds: `cameras.sfm` holds none."""
+    try:
+        found = [landmark["X"] for landmark in read_json(path).get("structure", [])]
+        points = np.array(found, float).reshape(-1, 3)
+    except (KeyError, TypeError, ValueError) as error:
+        raise refuse(path, "a structure without points X", "three numbers each", "Export it again") from error
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def _lens(known: _Intrinsic, from_middle: bool, where: str, path: Path) -> Lens:

@@ -18,6 +18,7 @@ from mistyle.io.sandbox.bounds import read_bytes, refuse
 from mistyle.io.sandbox.nearby import decoded, mesh_folders, unmarked
 
 MAX_HEADER = 1 << 20
+MAX_POINTS = 30_000_000
 TYPES = {
     "char": "i1",
     "uchar": "u1",
@@ -53,20 +54,9 @@ def read_ply(path: Path, max_faces: int) -> Raw:
     list texcoord); pictures of `comment TextureFile` (several by the faces' texnumber); colours of vertices or faces,
     which are the albedo where no picture is.
     """
-    data = read_bytes(path)
-    data = unmarked(data) if data.startswith(b"\xef\xbb\xbf") else data
-    elements, form, start = _ply_header(data, path)
-    for element in elements:
-        limit = max_faces if element.name == "face" else 3 * max_faces
-        too_many(element.count, limit, path, f"elements '{element.name}'")
-    tables = (
-        _ply_ascii(data[start:], elements, path) if form == "ascii" else _ply_binary(data, start, elements, form, path)
-    )
+    header, elements, tables = _tables(path, max_faces)
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
-    if not {"x", "y", "z"} <= set(vertex):
-        raise refuse(path, "no vertices with x, y and z", "a mesh", AGAIN)
-    with np.errstate(invalid="ignore"):  # a signalling NaN in a damaged file
-        positions = np.stack([vertex[k].astype(np.float64) for k in "xyz"], axis=1)
+    positions = _positions(vertex, path)
     sizes, corners = _polygons(tables)
     if len(sizes) == 0:
         raise refuse(
@@ -83,12 +73,40 @@ def read_ply(path: Path, max_faces: int) -> Raw:
             normals = np.stack([vertex[k].astype(np.float32) for k in ("nx", "ny", "nz")], axis=1)[triangles]
     polygon = np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))
     raw = plain_mesh("ply", positions, triangles, normals, _ply_uvs(vertex, face, sizes, triangles, pick))
-    raw, notes = _textured(raw, texture_files(data[:start]), face, polygon, path), small_faces(sizes)
+    raw, notes = _textured(raw, texture_files(header), face, polygon, path), small_faces(sizes)
     colours = _colours(tables, elements, triangles, polygon)
     if colours is not None:
         colours, materials, colour_notes = coloured(colours, raw.material, raw.materials)
         raw, notes = replace(raw, colours=colours, materials=materials), notes + colour_notes
     return replace(raw, notes=(*notes, *raw.notes))
+
+
+def read_ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """The finite vertices of a PLY, with or without faces; at most MAX_POINTS."""
+    _, _, tables = _tables(path, MAX_POINTS // 3)
+    points = _positions(tables.get("vertex", {}), path)
+    return points[np.isfinite(points).all(axis=1)]
+
+
+def _tables(path: Path, max_faces: int) -> tuple[bytes, list[_PlyElement], dict[str, dict]]:
+    """Header, elements, and the values of each element's properties."""
+    data = read_bytes(path)
+    data = unmarked(data) if data.startswith(b"\xef\xbb\xbf") else data
+    elements, form, start = _ply_header(data, path)
+    for element in elements:
+        limit = max_faces if element.name == "face" else 3 * max_faces
+        too_many(element.count, limit, path, f"elements '{element.name}'")
+    tables = (
+        _ply_ascii(data[start:], elements, path) if form == "ascii" else _ply_binary(data, start, elements, form, path)
+    )
+    return data[:start], elements, tables
+
+
+def _positions(vertex: dict, path: Path) -> Float[np.ndarray, "v 3"]:
+    if not {"x", "y", "z"} <= set(vertex):
+        raise refuse(path, "no vertices with x, y and z", "a mesh", AGAIN)
+    with np.errstate(invalid="ignore"):  # a signalling NaN in a damaged file
+        return np.stack([vertex[k].astype(np.float64) for k in "xyz"], axis=1)
 
 
 def texture_files(header: bytes) -> list[str]:

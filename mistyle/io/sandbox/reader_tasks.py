@@ -221,10 +221,11 @@ def colmap_model(folder: Path) -> list[Any]:
     return read_model(folder)
 
 
-def colmap_points(folder: Path) -> Any:
+def points(path: Path) -> Any:
     from mistyle.io.cameras.colmap import read_points
+    from mistyle.io.meshes.ply_read import read_ply_points
 
-    return read_points(folder)
+    return read_points(path) if path.is_dir() else read_ply_points(path)
 
 
 def metashape(path: Path) -> list[Any]:
@@ -276,7 +277,7 @@ TASKS: dict[str, Callable[..., Any]] = {
     "toml": toml,
     "yaml": yaml,
     "colmap_model": colmap_model,
-    "colmap_points": colmap_points,
+    "points": points,
     "metashape": metashape,
     "realityscan": realityscan,
 }

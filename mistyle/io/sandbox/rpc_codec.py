@@ -28,7 +28,6 @@ RECORDS = {
     "Corners": "mistyle.io.meshes.parsed_mesh:Corners",
     "Indexed": "mistyle.io.meshes.parsed_mesh:Indexed",
     "CameraFrame": "mistyle.io.cameras.camera_files:CameraFrame",
-    "SparsePoints": "mistyle.io.cameras.colmap:SparsePoints",
     "LayeredPicture": "mistyle.io.images.layers:LayeredPicture",
     "Layer": "mistyle.io.images.layers:Layer",
     "Raw": "mistyle.io.meshes.parsed_mesh:Raw",

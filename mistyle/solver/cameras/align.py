@@ -22,6 +22,7 @@ from mistyle.geometry.icp import align_points, in_masks, visual_hull
 from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
 
+MOST = 200_000  # points of a reconstruction; of more, evenly many
 LEVELS = (96, 256)  # pixels along the longer side, coarse to fine
 WAYS = 3  # registrations of the visual hull that are compared by silhouettes
 STEPS = 12  # at most, per level
@@ -62,11 +63,12 @@ def align_by_points(
     masks: Sequence[Bool[np.ndarray, "h w"]] | None,
     rng: np.random.Generator,
 ) -> Alignment:
-    """The similarity from COLMAP's points (those inside the masks, if any), then from the silhouettes.
+    """The similarity from a reconstruction's points (those inside the masks, if any), then from the silhouettes.
 
     Without masks all points must lie on the object. Raises InputRefused when they do not fit the mesh, or when two
     registrations fit equally well and no masks can decide.
     """
+    points = points[:: 1 + len(points) // MOST]
     own = points if masks is None else points[in_masks(points, cameras, masks)]
     if len(own) < 20:
         raise InputRefused(

@@ -23,9 +23,9 @@ from mistyle.io.cameras.captures import (
     read_captures,
     read_shots,
     silhouette,
-    sparse_points,
 )
 from mistyle.io.cameras.reading_notes import matte_note, reading_notes
+from mistyle.io.cameras.sparse_points import sparse_points
 from mistyle.io.cameras.views import write_views
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.read import read_size

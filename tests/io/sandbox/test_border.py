@@ -85,7 +85,7 @@ ALLOWED = {
     "stylization/mvst/sweep": "views that a run kept in its own folder",
 }
 # Names of decoding modules that others may import: records, and what only looks at paths or checked trees.
-TYPES = {"LayeredPicture", "Layer", "Window", "BEAUTY", "SparsePoints", "find_model", "models_below", "data_uri"}
+TYPES = {"LayeredPicture", "Layer", "Window", "BEAUTY", "find_model", "models_below", "data_uri"}
 TYPES |= {"frame_of", "picture_of"}  # arithmetic on what was decoded
 
 
