@@ -276,7 +276,9 @@ def _block(
     rays = _trace(surface, camera, lights, ray, sampling.shadows, soft is not None)
     point = rays.point
     face = mi.UInt32(point.prim_index)
-    dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv)
+    # Together: what is evaluated later traces the rays again, in a kernel for each component.
+    later = () if soft is None else (point.p, point.n, rays.frame)
+    dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv, *later)
     on, lit_rays = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
     hit = np.bincount(pixel[on] - row * width, minlength=mask.size).reshape(mask.shape)
     if not on.any():
