@@ -48,6 +48,8 @@ def few():
         for name in ("LEVELS", "OBSERVATIONS", "ATLAS"):
             patch.setattr(photometry, name, globals()[name])
         yield
+
+
 FALL = np.array([-0.25, -0.1, np.log(0.7) + 0.35])
 
 
