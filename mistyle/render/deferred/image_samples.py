@@ -276,8 +276,7 @@ def _block(
     rays = _trace(surface, camera, lights, ray, sampling.shadows, soft is not None)
     point = rays.point
     face = mi.UInt32(point.prim_index)
-    # Together: what is evaluated later traces the rays again, in a kernel for each component.
-    later = () if soft is None else (point.p, point.n, rays.frame)
+    later = () if soft is None else (point.p, point.n, rays.frame)  # otherwise traced again for each component
     dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv, *later)
     on, lit_rays = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
     hit = np.bincount(pixel[on] - row * width, minlength=mask.size).reshape(mask.shape)
@@ -398,8 +397,7 @@ def _pad(values: np.ndarray, size: int) -> np.ndarray:
 
 def camera_rays(camera: Camera, pixel: Any, x: Any, y: Any) -> Any:
     """Rays through the positions (x, y), 0..1, in the pixels (UInt32, row · width + column); unit directions."""
-    width = camera.size[1]
-    # Opaque: one kernel for all cameras.
+    width = camera.size[1]  # all else is opaque: one kernel for all cameras of this width
     scale, *centre = (dr.opaque(mi.Float, float(v)) for v in (1 / np.float32(camera.focal), *camera.centre))
     x = (mi.Float(pixel % width) + x - centre[0]) * scale
     y = (mi.Float(pixel // width) + y - centre[1]) * scale
