@@ -20,13 +20,23 @@ from mistyle.fitting.pipeline.job import MaterialJob
 from mistyle.fitting.pipeline.photometry import photometry_mode
 from mistyle.fitting.settings.material import MaterialSettings, PhotometrySettings
 from mistyle.io.read_mesh import read_mesh
+from mistyle.solver.photometry import material as with_material
 from mistyle.solver.photometry.record import Gains
 
 QUICK = {
-    "recover": {"solver": "texels", "rounds": 1, "solver_iterations": 8, "bounces": 0},
+    "recover": {"solver": "texels", "rounds": 1, "solver_iterations": 4, "bounces": 0, "joint": 0},
     "report": {"detail": "none"},
     "atlas": {"size": SIZE},
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """Half of the usual observations of a picture, which the solver's time is proportional to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(with_material, "OBSERVATIONS", 150 * 16)
+        patch.setattr(with_material, "LEAST_EACH", 150)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +56,7 @@ def test_exposures_under_known_light_are_solved_and_said(drawn, tmp_path, capsys
     done = gains(len(drawn.shots), 1)
     photograph(tmp_path / "shots", drawn, done)
     words = ["--atlas", SIZE, "--set", "recover.solver=texels", "--set", "recover.bounces=0", "--report", "none"]
+    words += ["--set", "recover.joint=0", "--set", "recover.rounds=1", "--set", "recover.solver_iterations=4"]
     shots = [tmp_path / "shots", "--masks", tmp_path / "shots" / "masks", "-o", tmp_path / "out"]
     assert main([str(word) for word in ("fit", drawn.file, *shots, *words)]) == 0
     assert "--photometry none" in capsys.readouterr().err

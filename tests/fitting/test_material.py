@@ -40,7 +40,8 @@ KEYS = [
     Directional((-0.6, 0.2, -0.775), (2.5, 2.4, 2.3), "camera"),
 ]
 QUICK = {
-    "recover": {"iterations": 72, "rounds": 2, "solver_iterations": 10},
+    "recover": {"iterations": 24, "rounds": 1, "solver_iterations": 8, "bounces": 1, "bounce_samples": 8, "joint": 1}
+    | {"joint_subsamples": 4},
     "report": {"frames": 4, "resolution": 96, "spp": 1},
 }
 
@@ -261,9 +262,9 @@ def test_a_light_that_nobody_knows(shots, tmp_path, monkeypatch):
     cameras = orbit(14, 0.5, 64)
     rigs = [(sun, Ambient((0.2, 0.2, 0.2)))] * len(cameras)
     write_views(tmp_path / "shots", photographed(asset.mesh, cameras, rigs), ())
-    monkeypatch.setattr(unknown_light, "OBSERVATIONS", 6000)
+    monkeypatch.setattr(unknown_light, "OBSERVATIONS", 3000)
     monkeypatch.setattr(unknown_light, "STEPS", (5, 3))
-    few = QUICK | {"recover": {"iterations": 24, "rounds": 1, "bounces": 0, "solver_iterations": 6}}
+    few = QUICK | {"recover": {"solver": "texels", "rounds": 1, "bounces": 0, "solver_iterations": 6, "joint": 0}}
     summary = mistyle.fit(
         shots / "bowl.obj", tmp_path / "shots", tmp_path / "out", lights="unknown", atlas={"size": SIZE},
         references={"hold_out": 2}, **few,

@@ -19,7 +19,7 @@ from mistyle.solver.indirect import Indirect
 from mistyle.solver.joint import pixels as joint_pixels
 from mistyle.solver.table import linked
 
-SAMPLES = 1024
+SAMPLES = 256
 
 
 @pytest.fixture(scope="module")

@@ -21,6 +21,7 @@ from mistyle.io.store.records import load_record, save_record
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
+from mistyle.solver.photometry import solve as photometry
 from mistyle.solver.photometry.ignored import ignored_cells
 from mistyle.solver.photometry.record import (
     EVERYWHERE,
@@ -36,7 +37,19 @@ from mistyle.solver.photometry.record import (
 )
 from mistyle.solver.photometry.solve import Response, _with_exif, solve_photometry
 
-SIDE, VIEWS, TEXELS = 128, 24, 128
+SIDE, VIEWS, TEXELS = 112, 24, 64
+LEVELS, OBSERVATIONS, ATLAS = 8_000, 80_000, 200  # of usually 40,000, 200,000 and 320
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """The solver's time is proportional to its observations."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("LEVELS", "OBSERVATIONS", "ATLAS"):
+            patch.setattr(photometry, name, globals()[name])
+        yield
+
+
 FALL = np.array([-0.25, -0.1, np.log(0.7) + 0.35])
 
 

@@ -23,6 +23,16 @@ from mistyle.solver.photometry.record import Gains, coordinates, fall_terms, unc
 from mistyle.solver.texels.levenberg_marquardt import Options
 
 SIDE, VIEWS, TEXELS = 96, 24, 64
+EACH = 100  # observations of a picture: a third of the usual number
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few():
+    """An eighth of the usual observations, which the solver's time is proportional to."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(material, "OBSERVATIONS", EACH * VIEWS)
+        patch.setattr(material, "LEAST_EACH", EACH)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_recover import RESOLUTION, SIZE, errors, fibonacci, photographs, strong_maps
+from test_recover import errors, fibonacci, photographs, strong_maps
 from test_seam import sphere
 
 from mistyle.atlas.texels import rasterise
@@ -142,10 +142,10 @@ def test_a_turned_environment_tells_albedo_and_normals():
     """The same ball as under delta lights, under one environment in three positions."""
     rows = np.linspace(0, 1, 16)[:, None, None] * np.ones((16, 32, 3))
     radiance = np.where(np.arange(32)[None, :, None] < 6, 6.0, 0.2) * (0.3 + rows)
-    cameras = [replace(c, name=f"{c.name}.{k}") for c in fibonacci(8, RESOLUTION) for k in range(3)]
+    cameras = [replace(c, name=f"{c.name}.{k}") for c in fibonacci(8, 64) for k in range(3)]
     lights = [(Environment(radiance.astype(np.float32), turn=120.0 * k),) for _ in range(8) for k in range(3)]
-    mesh, maps, texels = sphere(), strong_maps(), rasterise(sphere(), 0, SIZE)
-    pictures = photographs(mesh, [maps], cameras, lights, "mikkt", {"type": "direct"})
+    mesh, maps, texels = sphere(), strong_maps(size=40), rasterise(sphere(), 0, 40)
+    pictures = photographs(mesh, [maps], cameras, lights, "mikkt", {"type": "direct"}, 32)
     settings = RecoverSettings(solver="texels", bounces=0, solver_iterations=8, rounds=2)
     found = recover(mesh, [texels], in_memory(cameras, lights, pictures), settings, 0)
     chosen = texels.covered & (found.views[0] >= 2)

@@ -276,7 +276,8 @@ def _block(
     rays = _trace(surface, camera, lights, ray, sampling.shadows, soft is not None)
     point = rays.point
     face = mi.UInt32(point.prim_index)
-    dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv)
+    later = () if soft is None else (point.p, point.n, rays.frame)  # otherwise traced again for each component
+    dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv, *later)
     on, lit_rays = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
     hit = np.bincount(pixel[on] - row * width, minlength=mask.size).reshape(mask.shape)
     if not on.any():
@@ -396,22 +397,21 @@ def _pad(values: np.ndarray, size: int) -> np.ndarray:
 
 def camera_rays(camera: Camera, pixel: Any, x: Any, y: Any) -> Any:
     """Rays through the positions (x, y), 0..1, in the pixels (UInt32, row · width + column); unit directions."""
-    width = camera.size[1]
-    x = (mi.Float(pixel % width) + x - camera.centre[0]) / camera.focal
-    y = (mi.Float(pixel // width) + y - camera.centre[1]) / camera.focal
-    # New for every call: a product with a literal zero, which upright cameras contain, resizes that zero.
-    axes: list[Any] = [mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T]
-    right, down, forward = axes
-    return mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
+    width = camera.size[1]  # all else is opaque: one kernel for all cameras of this width
+    scale, *centre = (dr.opaque(mi.Float, float(v)) for v in (1 / np.float32(camera.focal), *camera.centre))
+    x = (mi.Float(pixel % width) + x - centre[0]) * scale
+    y = (mi.Float(pixel // width) + y - centre[1]) * scale
+    right, down, forward, eye = (dr.opaque(mi.Vector3f, axis.tolist()) for axis in camera.world_from_cam[:3].T)
+    return mi.Ray3f(mi.Point3f(eye), dr.normalize(right * x + down * y + forward))
 
 
 def _arriving(traced, point, light, camera: Camera, valid, shadows: bool) -> tuple[Any, Any]:
     """World direction to a delta light, and the share of its colour that arrives."""
     if isinstance(light, Directional):
-        direction = mi.Vector3f(direction_in_world(light, camera).tolist())
+        direction = dr.opaque(mi.Vector3f, direction_in_world(light, camera).tolist())
         strength, shadow = mi.Float(1), point.spawn_ray(direction)
     else:
-        position = mi.Point3f(position_in_world(light, camera).tolist())
+        position = dr.opaque(mi.Point3f, position_in_world(light, camera).tolist())
         away = position - point.p
         strength = dr.rcp(dr.squared_norm(away))
         direction, shadow = away * dr.sqrt(strength), point.spawn_ray_to(position)

@@ -126,7 +126,7 @@ def open_sky(
 
 def _shadow(point: Any, light: Light, camera: Camera) -> Any:
     if isinstance(light, Directional):
-        return point.spawn_ray(mi.Vector3f(direction_in_world(light, camera).tolist()))
+        return point.spawn_ray(dr.opaque(mi.Vector3f, direction_in_world(light, camera).tolist()))
     if isinstance(light, Point):
-        return point.spawn_ray_to(mi.Point3f(position_in_world(light, camera).tolist()))
+        return point.spawn_ray_to(dr.opaque(mi.Point3f, position_in_world(light, camera).tolist()))
     raise ValueError(f"{type(light).__name__} is not a delta light")
