@@ -20,11 +20,11 @@ from mistyle.stylization.pipeline.job import FIRST, REFINING, STAGES, Job
 from mistyle.stylization.settings import resolve
 
 TINY = {
-    "rig": {"resolution": 128},
+    "rig": {"resolution": 64},
     "draw": {"spp": 2},
     "surface": {"samples": 3000},
     "atlas": {"size": 128, "padding": 4},
-    "fit": {"refine": "all", "iterations1": 4, "iterations2": 4, "crops": 1, "crop_size": 64},
+    "fit": {"refine": "all", "iterations1": 4, "iterations2": 4, "crops": 1, "crop_size": 32},
     "report": {"frames": 4, "resolution": 64, "spp": 2},
     "threads": 2,
 }
@@ -92,24 +92,27 @@ def test_the_fit_moved_the_maps(whole):
     assert final.roughness.std() > 1e-5 and np.isfinite(final.normal).all()
 
 
-@pytest.mark.parametrize("stage", ["surface", "fit", "asset"])
-def test_a_stopped_run_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkeypatch, stage):
-    """Stopped in the middle of a stage, then run again: asset, stylized views and maps have the same bytes."""
-    module, function = {
-        "surface": (painting, "paint"), "fit": (pipeline, "fit"), "asset": (pipeline, "write_asset")
-    }[stage]  # fmt: skip
-    with monkeypatch.context() as patch:
+def test_a_run_stopped_in_three_stages_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkeypatch):
+    """Stopped in the middle of a stage, again in two later ones, then run to the end: asset, stylized views and maps
+    have the same bytes, and no run makes again what one before it had finished."""
 
-        def stop(*arguments, **keywords):
-            raise Stopped("on request")
+    def stop(*arguments, **keywords):
+        raise Stopped("on request")
 
-        patch.setattr(module, function, stop)
-        with pytest.raises(Stopped):
-            pipeline.stylize(job(inputs, tmp_path), Progress(quiet=True))
-    assert (tmp_path / "asset").exists() == (stage != "surface"), "the first asset is there once it is baked"
+    stops = {"surface": (painting, "paint"), "fit": (pipeline, "fit"), "asset": (pipeline, "write_asset")}
+    done = set()
+    for stage, (module, function) in stops.items():
+        progress = Progress(quiet=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(module, function, stop)
+            with pytest.raises(Stopped):
+                pipeline.stylize(job(inputs, tmp_path), progress)
+        assert (tmp_path / "asset").exists() == (stage != "surface"), "the first asset is there once it is baked"
+        assert set(progress.reused) == done, "what was finished before is taken over"
+        done = set(progress.seconds) - {stage}
     progress = Progress(quiet=True)
     pipeline.stylize(job(inputs, tmp_path), progress)
-    assert progress.reused, "what was finished before is taken over"
+    assert set(progress.reused) == done
     assert hashes(tmp_path) == hashes(whole)
 
 
