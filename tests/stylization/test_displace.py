@@ -22,7 +22,7 @@ from mistyle.stylization.pipeline.job import Job
 from mistyle.stylization.settings import resolve
 
 TINY = {
-    "rig": {"kind": "turntable", "views": 6, "resolution": 96},
+    "rig": {"resolution": 96},
     "surface": {"samples": 3000},
     "atlas": {"size": 128, "padding": 4},
     "report": {"detail": "page", "frames": 4, "resolution": 64, "spp": 2},

@@ -3,6 +3,7 @@ nothing is redone without need."""
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,29 +110,30 @@ def test_a_run_stopped_in_three_stages_resumes_to_the_same_bytes(inputs, whole, 
                 pipeline.stylize(job(inputs, tmp_path), progress)
         assert (tmp_path / "asset").exists() == (stage != "surface"), "the first asset is there once it is baked"
         assert set(progress.reused) == done, "what was finished before is taken over"
-        done = set(progress.seconds) - {stage}
+        done = set(progress.seconds) & set(STAGES) - {stage}
     progress = Progress(quiet=True)
     pipeline.stylize(job(inputs, tmp_path), progress)
     assert set(progress.reused) == done
     assert hashes(tmp_path) == hashes(whole)
 
 
-def test_a_painted_surface_is_final_by_default(inputs, tmp_path):
-    """No fit, no masks, no repair, no asset that another replaces; --from goes on behind what was left out."""
+def test_a_painted_surface_is_final_by_default(inputs, whole, tmp_path):
+    """Painted already, and nothing more; no fit, no masks, no repair, no asset that another replaces; --from goes on behind what was left out."""
     from mistyle.io.store.records import load_record
 
-    made, progress = job(inputs, tmp_path), Progress(quiet=True)
+    painted = shutil.ignore_patterns("masks", "asset", "report", "stylized", "fit", "repair")
+    made, progress = job(inputs, shutil.copytree(whole, tmp_path / "out", ignore=painted)), Progress(quiet=True)
     unfitted = made.settings.model_copy(update={"fit": made.settings.fit.model_copy(update={"refine": "auto"})})
     made = replace(made, settings=unfitted)
     summary = pipeline.stylize(made, progress)
     assert list(progress.seconds) == [name for name in STAGES if name not in REFINING]
-    assert summary["figures"]["repaired_share"] == 0 and not (tmp_path / "masks").exists()
-    baked = load_record(tmp_path / "work" / "bake" / "record").maps[0]
-    covered = load_record(tmp_path / "work" / "texels" / "record").texels[0].covered
+    assert summary["figures"]["repaired_share"] == 0 and not (made.out / "masks").exists()
+    baked = load_record(made.out / "work" / "bake" / "record").maps[0]
+    covered = load_record(made.out / "work" / "texels" / "record").texels[0].covered
     assert np.abs(baked.normal[covered, :2]).mean() > 0.02 and baked.roughness[covered].std() > 0.005
-    normal = np.asarray(Image.open(tmp_path / "asset" / "textures" / "bell_normal.png"), float)[..., :2] / 255 * 2 - 1
+    normal = np.asarray(Image.open(made.out / "asset" / "textures" / "bell_normal.png"), float)[..., :2] / 255 * 2 - 1
     assert np.abs(normal[covered] - baked.normal[covered, :2]).mean() < 0.02
-    assert "--refine all" in (tmp_path / "report" / "index.html").read_text()
+    assert "--refine all" in (made.out / "report" / "index.html").read_text()
     again = Progress(quiet=True)
     pipeline.stylize(replace(made, redo_from="repair"), again)
     assert "bake" in again.reused and "asset" not in again.reused
