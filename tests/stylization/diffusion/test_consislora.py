@@ -344,7 +344,9 @@ def test_what_is_no_lora_is_refused(tmp_path):
 def test_float32_loras_learn_over_a_frozen_half_precision_network(picture, precision, tmp_path):
     settings = ModelSettings(folder=tiny_models.folder(), device="cpu", precision=precision)
     half = consislora_make.trainer(settings)
-    halves, _, errors = made(half, picture, tmp_path, settings=SETTINGS.model_copy(update={"steps": 1, "style_steps": 1}))
+    halves, _, errors = made(
+        half, picture, tmp_path, settings=SETTINGS.model_copy(update={"steps": 1, "style_steps": 1})
+    )
     assert half.vae.dtype == torch.float32 and half.unet.dtype == getattr(torch, precision)
     assert np.isfinite(errors).all()
     assert all(v.dtype == torch.float32 for v in consislora.read_lora(halves.style).values())
