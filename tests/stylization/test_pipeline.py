@@ -118,7 +118,8 @@ def test_a_run_stopped_in_three_stages_resumes_to_the_same_bytes(inputs, whole, 
 
 
 def test_a_painted_surface_is_final_by_default(inputs, whole, tmp_path):
-    """Painted already, and nothing more; no fit, no masks, no repair, no asset that another replaces; --from goes on behind what was left out."""
+    """Goes on from what was painted: no fit, no masks, no repair, no asset that another replaces; --from goes on behind
+    what was left out."""
     from mistyle.io.store.records import load_record
 
     painted = shutil.ignore_patterns("masks", "asset", "report", "stylized", "fit", "repair")
