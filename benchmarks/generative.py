@@ -73,7 +73,7 @@ TINY: dict[str, Any] = {
     "stem": (16, 32),
     "vae": (32, 64),
     "pooled": 32,
-    "side": 64,
+    "side": 32,
     "rank": 4,
 }
 
@@ -243,7 +243,7 @@ def painted(made: Any, stylizer: str, resumed: bool, work: Path) -> bool:
     from mistyle.stylization.diffusion.settings import DiffusionSettings, TrainSettings
     from mistyle.stylization.diffusion.stylizer import DiffusionJob
 
-    sampling = DiffusionSettings(adapter=cast(Any, stylizer), steps=2, block=1, repeats=2, refinement=0.5)
+    sampling = DiffusionSettings(adapter=cast(Any, stylizer), steps=1, block=1, repeats=2, refinement=1.0)
     training = TrainSettings(rank=4, steps=2, style_steps=1, switch=1, resolution=16)
     job = DiffusionJob(made, training, sampling, noise(), "style", work / "loras", 0)
     with tempfile.TemporaryDirectory() as kept:

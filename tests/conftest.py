@@ -20,6 +20,9 @@ ALLOWED_SKIPS = {
 skipped: list[tuple[str, str]] = []
 
 environment.use_llvm()
+# Tests import torch before a job tells OpenMP how to wait (mistyle/process/cores.py): threads that spin on two busy
+# cores made a small network's operations eight times slower.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # Read when Ray is imported: the engine sets it, but here tests may import Ray before the engine does.
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 settings.register_profile("mistyle", deadline=None, derandomize=True, database=None)

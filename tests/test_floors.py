@@ -66,9 +66,13 @@ PAPER_LINES = 35_142  # the goal is 27,000
 
 
 @cache
-def tree_of(path: Path) -> ast.Module:
+def parsed(source: str) -> ast.Module:
     """A module's syntax tree, parsed once."""
-    return ast.parse(path.read_text("utf-8"))
+    return ast.parse(source)
+
+
+def tree_of(path: Path) -> ast.Module:
+    return parsed(path.read_text("utf-8"))
 
 
 def parts_of(path: Path, root: Path) -> tuple[str, ...]:
@@ -87,7 +91,7 @@ def modules() -> dict[tuple[str, ...], Path]:
 def imported(source: str, package: list[str], *, at_import: bool = False) -> set[str]:
     """Dotted names of all that the module `source` in `package` imports; with `at_import` not those in functions."""
     names: set[str] = set()
-    left: list[ast.AST] = [ast.parse(source)]
+    left: list[ast.AST] = [parsed(source)]
     while left:
         node = left.pop()
         if at_import and isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):

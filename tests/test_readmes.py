@@ -32,7 +32,7 @@ MARK = "<!-- run -->"
 FOLDERS = ("mistyle", "scenes", "tests", "benchmarks")
 READMES = sorted([*ROOT.glob("*.md"), *(path for top in FOLDERS for path in (ROOT / top).rglob("*.md"))])
 # Settings that keep the executed blocks short.
-SMALL = "rig.resolution=64;atlas.size=128;surface.samples=2000;fit.refine=off;report.detail=none;report.frames=4"
+SMALL = "rig.resolution=64;draw.spp=1;atlas.size=128;surface.samples=1000;fit.refine=off;report.detail=none"
 
 
 @dataclass(frozen=True)

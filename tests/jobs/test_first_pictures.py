@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -36,27 +37,28 @@ def sized(job, **report):
     )
 
 
-@pytest.fixture
-def stopped(inputs, tmp_path, monkeypatch):  # noqa: F811
-    """A job that is stopped as its fit begins: its folder, and what was said."""
+@pytest.fixture(scope="module")
+def stopped(inputs, tmp_path_factory):  # noqa: F811
+    """A job that is stopped as its fit begins: its folder, of which tests take copies, and what was said."""
 
     def stop(*_):
         raise Stopped("stopped")
 
-    progress = Heard()
-    with monkeypatch.context() as patch:
+    out, progress = tmp_path_factory.mktemp("stopped") / "out", Heard()
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "fit", stop)
         with pytest.raises(Stopped):
-            pipeline.stylize(job(inputs, tmp_path / "out"), progress)
-    return tmp_path / "out", progress.lines
+            pipeline.stylize(job(inputs, out), progress)
+    return out, progress.lines
 
 
-def test_the_first_asset_is_announced_before_the_fit_and_replaced_after_it(inputs, stopped):  # noqa: F811
-    out, lines = stopped
+def test_the_first_asset_is_announced_before_the_fit_and_replaced_after_it(inputs, stopped, tmp_path):  # noqa: F811
+    folder, lines = stopped
     told = next(k for k, line in enumerate(lines) if "painted and baked" in line)
-    assert str(out / "asset" / "bell.glb") in lines[told] and re.search(r"\d+ s after the start", lines[told])
+    assert str(folder / "asset" / "bell.glb") in lines[told] and re.search(r"\d+ s after the start", lines[told])
     starts = {name: next(k for k, line in enumerate(lines) if line.startswith(name)) for name in ("bake the", "fit ")}
     assert starts["bake the"] < told < starts["fit "]
+    out = shutil.copytree(folder, tmp_path / "out")
     assert json.loads((out / "asset" / "done.json").read_text())["first"] is True
     assert json.loads((out / "run.json").read_text())["finished"] is False
     early = read_finished(out)
@@ -73,8 +75,8 @@ def test_the_first_asset_is_announced_before_the_fit_and_replaced_after_it(input
     assert (out / "asset" / "mine.txt").read_text() == "mine" and not list((out / "asset").glob(".*"))
 
 
-def test_an_edit_of_the_first_asset_is_set_aside_not_lost(inputs, stopped):  # noqa: F811
-    out, _ = stopped
+def test_an_edit_of_the_first_asset_is_set_aside_not_lost(inputs, stopped, tmp_path):  # noqa: F811
+    out = shutil.copytree(stopped[0], tmp_path / "out")
     file = out / "asset" / "textures" / "bell_albedo.png"
     file.write_bytes(b"mine")
     progress = Heard()

@@ -6,12 +6,13 @@ edited, and that an older version left without a record. What is not mistyle's m
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 from verbs import ATLAS, PAINT, VERBS, line
 
+from mistyle.batch import engines
 from mistyle.cli.main import main
 from mistyle.io.store import output
 
@@ -36,6 +37,21 @@ def no_network(monkeypatch):
 
     monkeypatch.setattr(pack, "_fill", fill)
     monkeypatch.setattr(pack, "llvm_files", lambda: (Path("lib"), []))
+
+
+@pytest.fixture
+def shards_at_hand(monkeypatch):
+    """A batch's shards run here; that they are processes of their own is tested in tests/batch."""
+
+    def run(plan: engines.BatchPlan, todo: Sequence[int], workers: int, watch: engines.Watch, timeout: float | None):
+        ended = []
+        for index in todo:
+            watch(index, None)
+            ended.append(engines.Ended(index, main(engines.command(plan, index)[3:]), 1))
+            watch(index, ended[-1])
+        return ended
+
+    monkeypatch.setattr(engines, "local", run)
 
 
 def strangers(folder: Path) -> None:
@@ -116,7 +132,7 @@ def test_a_folder_of_an_older_version_is_refused_with_that_reason(verb_inputs, t
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_strangers_files_stay_in_every_run(verb_inputs, tmp_path, capsys, verb):
+def test_strangers_files_stay_in_every_run(verb_inputs, tmp_path, capsys, shards_at_hand, verb):
     """Into the folder of the inputs, through a link, again, over an edited file, without the record, by force."""
     place = tmp_path / "disk" / "inputs"
     shutil.copytree(verb_inputs, place, symlinks=True)

@@ -3,6 +3,7 @@ nothing is redone without need."""
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,11 +21,11 @@ from mistyle.stylization.pipeline.job import FIRST, REFINING, STAGES, Job
 from mistyle.stylization.settings import resolve
 
 TINY = {
-    "rig": {"resolution": 128},
+    "rig": {"resolution": 64},
     "draw": {"spp": 2},
     "surface": {"samples": 3000},
     "atlas": {"size": 128, "padding": 4},
-    "fit": {"refine": "all", "iterations1": 4, "iterations2": 4, "crops": 1, "crop_size": 64},
+    "fit": {"refine": "all", "iterations1": 4, "iterations2": 4, "crops": 1, "crop_size": 32},
     "report": {"frames": 4, "resolution": 64, "spp": 2},
     "threads": 2,
 }
@@ -92,43 +93,48 @@ def test_the_fit_moved_the_maps(whole):
     assert final.roughness.std() > 1e-5 and np.isfinite(final.normal).all()
 
 
-@pytest.mark.parametrize("stage", ["surface", "fit", "asset"])
-def test_a_stopped_run_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkeypatch, stage):
-    """Stopped in the middle of a stage, then run again: asset, stylized views and maps have the same bytes."""
-    module, function = {
-        "surface": (painting, "paint"), "fit": (pipeline, "fit"), "asset": (pipeline, "write_asset")
-    }[stage]  # fmt: skip
-    with monkeypatch.context() as patch:
+def test_a_run_stopped_in_three_stages_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkeypatch):
+    """Stopped in the middle of a stage, again in two later ones, then run to the end: asset, stylized views and maps
+    have the same bytes, and no run makes again what one before it had finished."""
 
-        def stop(*arguments, **keywords):
-            raise Stopped("on request")
+    def stop(*arguments, **keywords):
+        raise Stopped("on request")
 
-        patch.setattr(module, function, stop)
-        with pytest.raises(Stopped):
-            pipeline.stylize(job(inputs, tmp_path), Progress(quiet=True))
-    assert (tmp_path / "asset").exists() == (stage != "surface"), "the first asset is there once it is baked"
+    stops = {"surface": (painting, "paint"), "fit": (pipeline, "fit"), "asset": (pipeline, "write_asset")}
+    done = set()
+    for stage, (module, function) in stops.items():
+        progress = Progress(quiet=True)
+        with monkeypatch.context() as patch:
+            patch.setattr(module, function, stop)
+            with pytest.raises(Stopped):
+                pipeline.stylize(job(inputs, tmp_path), progress)
+        assert (tmp_path / "asset").exists() == (stage != "surface"), "the first asset is there once it is baked"
+        assert set(progress.reused) == done, "what was finished before is taken over"
+        done = set(progress.seconds) & set(STAGES) - {stage}
     progress = Progress(quiet=True)
     pipeline.stylize(job(inputs, tmp_path), progress)
-    assert progress.reused, "what was finished before is taken over"
+    assert set(progress.reused) == done
     assert hashes(tmp_path) == hashes(whole)
 
 
-def test_a_painted_surface_is_final_by_default(inputs, tmp_path):
-    """No fit, no masks, no repair, no asset that another replaces; --from goes on behind what was left out."""
+def test_a_painted_surface_is_final_by_default(inputs, whole, tmp_path):
+    """Goes on from what was painted: no fit, no masks, no repair, no asset that another replaces; --from goes on behind
+    what was left out."""
     from mistyle.io.store.records import load_record
 
-    made, progress = job(inputs, tmp_path), Progress(quiet=True)
+    painted = shutil.ignore_patterns("masks", "asset", "report", "stylized", "fit", "repair")
+    made, progress = job(inputs, shutil.copytree(whole, tmp_path / "out", ignore=painted)), Progress(quiet=True)
     unfitted = made.settings.model_copy(update={"fit": made.settings.fit.model_copy(update={"refine": "auto"})})
     made = replace(made, settings=unfitted)
     summary = pipeline.stylize(made, progress)
     assert list(progress.seconds) == [name for name in STAGES if name not in REFINING]
-    assert summary["figures"]["repaired_share"] == 0 and not (tmp_path / "masks").exists()
-    baked = load_record(tmp_path / "work" / "bake" / "record").maps[0]
-    covered = load_record(tmp_path / "work" / "texels" / "record").texels[0].covered
+    assert summary["figures"]["repaired_share"] == 0 and not (made.out / "masks").exists()
+    baked = load_record(made.out / "work" / "bake" / "record").maps[0]
+    covered = load_record(made.out / "work" / "texels" / "record").texels[0].covered
     assert np.abs(baked.normal[covered, :2]).mean() > 0.02 and baked.roughness[covered].std() > 0.005
-    normal = np.asarray(Image.open(tmp_path / "asset" / "textures" / "bell_normal.png"), float)[..., :2] / 255 * 2 - 1
+    normal = np.asarray(Image.open(made.out / "asset" / "textures" / "bell_normal.png"), float)[..., :2] / 255 * 2 - 1
     assert np.abs(normal[covered] - baked.normal[covered, :2]).mean() < 0.02
-    assert "--refine all" in (tmp_path / "report" / "index.html").read_text()
+    assert "--refine all" in (made.out / "report" / "index.html").read_text()
     again = Progress(quiet=True)
     pipeline.stylize(replace(made, redo_from="repair"), again)
     assert "bake" in again.reused and "asset" not in again.reused

@@ -19,11 +19,11 @@ import numpy as np
 PATIENCE = 240  # seconds after which it says where each thread stands, and ends
 SETTINGS = {
     "threads": 2,
-    "rig": {"resolution": 96},
+    "rig": {"resolution": 64},
     "draw": {"spp": 2, "paper_files": True},
-    "surface": {"samples": 1500},
+    "surface": {"samples": 1000},
     "atlas": {"size": 96, "padding": 4},
-    "fit": {"refine": "all", "iterations1": 4, "iterations2": 4, "crops": 2, "crop_size": 64},
+    "fit": {"refine": "all", "iterations1": 2, "iterations2": 2, "crops": 2, "crop_size": 48},
 }
 
 

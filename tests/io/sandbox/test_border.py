@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +90,7 @@ TYPES = {"LayeredPicture", "Layer", "Window", "BEAUTY", "find_model", "models_be
 TYPES |= {"frame_of", "picture_of"}  # arithmetic on what was decoded
 
 
+@cache
 def modules() -> dict[str, ast.Module]:
     paths = sorted((ROOT / "mistyle").rglob("*.py"))
     return {p.relative_to(ROOT / "mistyle").with_suffix("").as_posix(): ast.parse(p.read_text("utf-8")) for p in paths}

@@ -177,8 +177,10 @@ def made(pipeline, picture, folder, name="style", kind="style", settings=SETTING
     return halves, key, errors
 
 
-def test_stage_two_leaves_the_content_half_untouched(pipeline, picture, monkeypatch, tmp_path):
-    seen = []
+@pytest.fixture(scope="module")
+def whole(pipeline, picture, tmp_path_factory):
+    """An undisturbed training: its folder, its halves, its errors, and both phases with the weights around them."""
+    folder, seen = tmp_path_factory.mktemp("whole"), []
     original = consislora_train.run_phase
 
     def watched(pipeline, shown, phase, *rest):
@@ -187,8 +189,14 @@ def test_stage_two_leaves_the_content_half_untouched(pipeline, picture, monkeypa
         seen.append((phase, before, {half: weights(pipeline.unet, half) for half in consislora.BLOCKS}))
         return errors
 
-    monkeypatch.setattr(consislora_train, "run_phase", watched)
-    halves, _, errors = made(pipeline, picture, tmp_path)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(consislora_train, "run_phase", watched)
+        halves, _, errors = made(pipeline, picture, folder)
+    return folder, halves, errors, seen
+
+
+def test_stage_two_leaves_the_content_half_untouched(whole):
+    folder, halves, errors, seen = whole
     (one, _, after_one), (two, before, after) = seen
     assert (one.prompt, two.prompt) == ("A [v]", "An image in the style of [v]") and len(errors) == 10
     assert (two.switch, two.noise_offset, two.trained, two.frozen) == (0, 0.03, ("style",), ("content",))
@@ -196,13 +204,11 @@ def test_stage_two_leaves_the_content_half_untouched(pipeline, picture, monkeypa
         assert torch.equal(value, before["content"][name]) and torch.equal(value, after_one["content"][name])
     assert all(not v.any() for k, v in before["style"].items() if "lora_B" in k), "the style half starts afresh"
     assert any(not torch.equal(v, before["style"][k]) for k, v in after["style"].items())
-    assert halves.content.is_file() and halves.style.is_file() and not list(tmp_path.glob("*training*"))
+    assert halves.content.is_file() and halves.style.is_file() and not list(folder.glob("*training*"))
 
 
 @pytest.mark.parametrize("stop", [1, 5, 8])
-def test_a_stopped_training_ends_with_the_same_bits(pipeline, picture, tmp_path, stop):
-    whole, _, _ = made(pipeline, picture, tmp_path / "whole")
-
+def test_a_stopped_training_ends_with_the_same_bits(pipeline, picture, whole, tmp_path, stop):
     def watch(step: int, steps: int, loss: float) -> None:
         if step == stop:
             raise Stopped("on request")
@@ -211,13 +217,11 @@ def test_a_stopped_training_ends_with_the_same_bits(pipeline, picture, tmp_path,
         made(pipeline, picture, tmp_path / "cut", watch=watch)
     again, _, errors = made(pipeline, picture, tmp_path / "cut")
     assert len(errors) <= 10
-    for ours, theirs in ((again.content, whole.content), (again.style, whole.style)):
+    for ours, theirs in ((again.content, whole[1].content), (again.style, whole[1].style)):
         assert ours.read_bytes() == theirs.read_bytes()
 
 
-def test_a_killed_training_goes_on_from_its_last_checkpoint(pipeline, picture, tmp_path):
-    whole, _, _ = made(pipeline, picture, tmp_path / "whole")
-
+def test_a_killed_training_goes_on_from_its_last_checkpoint(pipeline, picture, whole, tmp_path):
     def watch(step: int, steps: int, loss: float) -> None:
         if step == 5:
             raise RuntimeError("killed: nothing more is written")
@@ -227,7 +231,7 @@ def test_a_killed_training_goes_on_from_its_last_checkpoint(pipeline, picture, t
     steps = []
     again, _, _ = made(pipeline, picture, tmp_path / "cut", watch=lambda step, *_: steps.append(step))
     assert steps[0] == 5, "four steps were in the checkpoint"
-    assert again.style.read_bytes() == whole.style.read_bytes()
+    assert again.style.read_bytes() == whole[1].style.read_bytes()
 
 
 def test_a_finished_lora_is_taken_over_and_settings_change_its_name(pipeline, picture, tmp_path):
@@ -340,7 +344,9 @@ def test_what_is_no_lora_is_refused(tmp_path):
 def test_float32_loras_learn_over_a_frozen_half_precision_network(picture, precision, tmp_path):
     settings = ModelSettings(folder=tiny_models.folder(), device="cpu", precision=precision)
     half = consislora_make.trainer(settings)
-    halves, _, errors = made(half, picture, tmp_path, settings=SETTINGS.model_copy(update={"steps": 3}))
+    halves, _, errors = made(
+        half, picture, tmp_path, settings=SETTINGS.model_copy(update={"steps": 1, "style_steps": 1})
+    )
     assert half.vae.dtype == torch.float32 and half.unet.dtype == getattr(torch, precision)
     assert np.isfinite(errors).all()
     assert all(v.dtype == torch.float32 for v in consislora.read_lora(halves.style).values())

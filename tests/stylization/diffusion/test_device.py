@@ -54,30 +54,29 @@ def painter(tmp_path, seen, change: dict, **more):
     return diffusion.stylizer(replace(job, training=short), seen)
 
 
-def paint(tmp_path, adapter: str, **more) -> list[np.ndarray]:
-    """A later view first, as a resumed sweep has it, then one whose content LoRA takes the first one's place."""
-    content = "per-view" if adapter == "lora" else "none"
+LORA = {"content": "per-view", "style_guidance": 1.0, "content_guidance": 1.0}
+IP = {"adapter": "ip", "content": "none"}
+
+
+def paint(tmp_path, change: dict, **more) -> tuple[list[np.ndarray], int]:
+    """A later view first, as a resumed sweep has it, then one whose content LoRA takes the first one's place; and the
+    bytes on the device while the networks are at hand."""
     seen = [views_of.view(0.0), views_of.view(30.0)]
-    paints = painter(tmp_path, seen, {"adapter": adapter, "content": content}, precision="float32", **more)
+    paints = painter(tmp_path, seen, change, precision="float32", **more)
     rng = np.random.default_rng(0)
-    return [paints(v, p, rng) for v, p in ((seen[1], views_of.half_prior()), (seen[0], None))]
+    return [paints(v, p, rng) for v, p in ((seen[1], views_of.half_prior()), (seen[0], None))], standin.bytes_alive()
 
 
-@pytest.mark.parametrize("adapter", ["lora", "ip"])
-def test_views_are_painted_on_the_device_offloaded_or_not(tmp_path, monkeypatch, adapter):
-    plain = paint(tmp_path, adapter)
+@pytest.mark.parametrize("change", [LORA, IP], ids=["lora", "ip"])
+def test_views_are_painted_on_the_device_offloaded_or_not(tmp_path, monkeypatch, change):
+    """LoRAs with guidance, which needs four halves at once, or the IP-Adapter."""
+    plain, _ = paint(tmp_path, change)
     with standin.device(monkeypatch):
-        answers = [paint(tmp_path, adapter, offload=offload) for offload in (False, True)]
+        (whole, held), (offloaded, less) = (paint(tmp_path, change, offload=offload) for offload in (False, True))
         assert standin.bytes_alive() == 0
-    assert np.array_equal(*(np.stack(pictures) for pictures in answers)), "offloading changes no number"
-    np.testing.assert_allclose(np.stack(answers[0]), np.stack(plain), atol=2e-3)
-
-
-def test_guidance_finds_everything_on_the_device(tmp_path, monkeypatch):
-    change = {"content": "shared", "style_guidance": 1.0, "content_guidance": 1.0}
-    with standin.device(monkeypatch):
-        paints = painter(tmp_path, [views_of.view()], change, offload=True)
-        assert np.isfinite(paints(views_of.view(), views_of.half_prior(), np.random.default_rng(0))).all()
+    assert np.array_equal(np.stack(whole), np.stack(offloaded)), "offloading changes no number"
+    assert less < 0.7 * held, "offloading keeps less on the device"
+    np.testing.assert_allclose(np.stack(whole), np.stack(plain), atol=2e-3)
 
 
 @pytest.mark.parametrize("recipe", list(paint3d.RECIPES))
@@ -94,19 +93,9 @@ def test_the_inpainter_runs_on_the_device_offloaded_or_not(monkeypatch, recipe):
     assert np.array_equal(*answers) and np.isfinite(answers[0]).all()
 
 
-def test_offloading_keeps_less_on_the_device(tmp_path, monkeypatch):
-    held = []
-    with standin.device(monkeypatch):
-        for offload in (False, True):
-            made, _ = diffusion._pipeline(views_of.job(tmp_path, offload=offload))
-            views_of.paint(made, ONCE)
-            held.append(standin.bytes_alive())
-            del made
-    assert held[1] < 0.7 * held[0]
-
-
 def test_nothing_is_left_on_the_device_when_a_stage_asks_what_is_free(tmp_path, monkeypatch):
-    """Sweep with its training, then repair, as a job runs them: every question is asked of an empty device."""
+    """Sweep with its training, then repair, as a job runs them: every question is asked of an empty device, and the
+    training has given its memory back before the stylizer loads."""
     from mistyle.stylization.pipeline import stylize as pipeline
     from mistyle.stylization.pipeline.sweep import swept
 
@@ -124,6 +113,9 @@ def test_nothing_is_left_on_the_device_when_a_stage_asks_what_is_free(tmp_path, 
     fitted = Fit(maps, nothing, nothing, {}, {}, {}, ())
     masks = [atlas_of.middle() & texels.covered]
     held: list[int] = []
+    left: list[int] = []
+    load = diffusion._pipeline
+    monkeypatch.setattr(diffusion, "_pipeline", lambda job: left.append(standin.bytes_alive()) or load(job))
 
     def report(done: float) -> None:
         held.append(standin.bytes_alive())
@@ -132,19 +124,11 @@ def test_nothing_is_left_on_the_device_when_a_stage_asks_what_is_free(tmp_path, 
         run.keys["surface"] = "k"
         swept(run, asset, style, atlas, [views_of.view()], report)
         assert len(found) == 2 and max(held) > 0 == standin.bytes_alive(), "stylizer and training asked"
+        assert left == [0]
         monkeypatch.setattr(pipeline, "settle_relief", lambda *a: held.append(standin.bytes_alive()) or a[2])
         pipeline.repair(asset, style, atlas, baked, [], fitted, masks, settings, report)
         assert len(found) == 3 and held[-2] > held[-1] == 0 == standin.bytes_alive()
     assert not any(found)
-
-
-def test_training_gives_its_memory_back_before_the_stylizer_loads(tmp_path, monkeypatch):
-    left = []
-    original = diffusion._pipeline
-    monkeypatch.setattr(diffusion, "_pipeline", lambda job: left.append(standin.bytes_alive()) or original(job))
-    with standin.device(monkeypatch):
-        painter(tmp_path, [views_of.view()], {})
-    assert left == [0]
 
 
 @pytest.mark.parametrize(

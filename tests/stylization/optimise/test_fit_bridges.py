@@ -82,7 +82,7 @@ def test_frozen_functions_are_recorded_once_per_phase(scene):
 @pytest.mark.parametrize("choice", ["together", "one-per-view"])
 def test_a_relief_is_found_under_either_way_of_lighting(scene, choice):
     mesh, maps, texels, views = scene
-    settings = QUICK.model_copy(update={"refine": "normal-roughness", "iterations1": 30, "lights": choice})
+    settings = QUICK.model_copy(update={"refine": "normal-roughness", "iterations1": 20, "lights": choice})
     made = two_phase(mesh, FitStart([maps]), FitTargets(views), [texels], settings, 0).maps[0]
     seen = texels.covered & (np.abs(texels.normal[..., 1]) < 0.8)
     down, across = np.gradient(gaussian(srgb_from_linear(maps.albedo).mean(axis=-1), 1.0))
@@ -141,12 +141,12 @@ def test_a_whole_job_with_the_real_vgg(tmp_path):
     cv2.imwrite(str(style), cv2.resize(cv2.imread(str(data("styles/great_wave.jpg"))), (160, 96)))
     mesh = PACKAGE.parent / "scenes" / "demo.obj"
     small = {
-        "rig": {"resolution": 96},
+        "rig": {"kind": "turntable", "views": 4, "resolution": 64},
         "draw": {"spp": 1},
-        "surface": {"samples": 3000},
+        "surface": {"samples": 1000},
         "atlas": {"size": 128},
         "fit": {"features": str(data(VGG)), "iterations1": 3, "iterations2": 3, "crops": 1, "crop_size": 48},
-        "report": {"frames": 4, "resolution": 64, "spp": 1},
+        "report": {"detail": "none"},
     }
     summary = mistyle.stylize(mesh, style, tmp_path / "out", preset="draft", name="bell", **small)
     assert {"phase1.style", "phase2.style"} <= set(summary["figures"])

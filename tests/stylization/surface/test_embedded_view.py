@@ -179,13 +179,14 @@ def test_a_sweep_agrees_where_single_views_do_not(paint):
 
 
 def by_view(inputs, out, **more) -> Job:
-    few = {"rig": {"kind": "turntable", "views": 4, "resolution": 64}, "fit": TINY["fit"] | {"refine": "off"}}
+    few = {"rig": {"kind": "turntable", "views": 3, "resolution": 48}, "fit": TINY["fit"] | {"refine": "off"}}
+    few |= {"surface": {"samples": 1000}, "report": {"detail": "none"}}
     chosen = resolve("draft", None, TINY | few | {"stylizer": "embedded-view"} | more, {})
     return replace(job(inputs, out), settings=chosen)
 
 
 def test_the_job_with_this_stylizer_and_its_resumption(inputs, tmp_path, monkeypatch):
-    """Killed in the fourth view, run again: only the rest is painted, and every file ends with the same bytes."""
+    """Killed in the third view, run again: only the rest is painted, and every file ends with the same bytes."""
     from mistyle.stylization.surface import painter as embedded_view
 
     pipeline.stylize(by_view(inputs, tmp_path / "whole"), Progress(quiet=True))
@@ -196,7 +197,7 @@ def test_the_job_with_this_stylizer_and_its_resumption(inputs, tmp_path, monkeyp
         stylizer = make(*given, **named)
 
         def paint(view, prior, rng):
-            if len(painted) == 3:
+            if len(painted) == 2:
                 raise KeyboardInterrupt
             painted.append(view.camera.name)
             return stylizer(view, prior, rng)
@@ -207,12 +208,12 @@ def test_the_job_with_this_stylizer_and_its_resumption(inputs, tmp_path, monkeyp
         patch.setattr(embedded_view, "stylizer", killed)
         with pytest.raises(KeyboardInterrupt):
             pipeline.stylize(by_view(inputs, tmp_path / "again"), Progress(quiet=True))
-    assert len(list((tmp_path / "again" / "work" / "sweep").glob("*.npz"))) == 3
-    painted[:] = ["none of these counts"] * 4
+    assert len(list((tmp_path / "again" / "work" / "sweep").glob("*.npz"))) == 2
+    painted[:] = ["none of these counts"] * 3
     with monkeypatch.context() as patch:
         patch.setattr(embedded_view, "stylizer", killed)
         pipeline.stylize(by_view(inputs, tmp_path / "again"), Progress(quiet=True))
-    assert len(painted) == 4 + 1
+    assert len(painted) == 3 + 1
     assert not (tmp_path / "again" / "work" / "sweep").exists()
     assert hashes(tmp_path / "again") == hashes(tmp_path / "whole")
 

@@ -99,7 +99,7 @@ def dj():
     return kernels.module("llvm")
 
 
-SMALL = fixed_surface(samples=2500)
+SMALL = fixed_surface(samples=1500)
 
 
 @pytest.fixture(scope="module")
