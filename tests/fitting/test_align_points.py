@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOT
+from helpers import ROOT, point_cloud
 from scipy.spatial.transform import Rotation
-from test_sparse_points import cloud
 
 from benchmarks import recovery_pictures as drawing
 from mistyle.core.mesh import spread_points
@@ -18,6 +17,7 @@ from mistyle.fitting.settings.material import MaterialSettings, ReferenceSetting
 from mistyle.geometry.similarity import degrees_between, moved_camera, similarity
 from mistyle.io.cameras.camera_files import transforms
 from mistyle.io.cameras.captures import read_shots
+from mistyle.io.cameras.sparse_points import sparse_points
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
 
@@ -37,7 +37,7 @@ def scene(folder: Path, rng: np.random.Generator) -> tuple:
     for camera in strange:
         write_png(folder / f"{camera.name}.png", np.full((24, 24, 3), 0.5, np.float32))
     points = spread_points(asset.mesh.positions, asset.mesh.faces, 3000, rng).position
-    cloud(folder / "points.ply", points @ away[:3, :3].T + away[:3, 3])
+    point_cloud(folder / "points.ply", points @ away[:3, :3].T + away[:3, 3])
     return asset, cameras
 
 
@@ -47,7 +47,7 @@ def test_points_without_masks_place_the_cameras(tmp_path, rng, up):
     asset, cameras = scene(tmp_path, rng)
     settings = MaterialSettings(references=ReferenceSettings(align=True, up=up))
     job = MaterialJob(MESH, tmp_path, tmp_path / "out", settings, "demo", lights="unknown")
-    placed = place(job, asset, references_of(job), read_shots(tmp_path), lambda done: None)
+    placed = place(job, asset, references_of(job), read_shots(tmp_path), lambda done: None, sparse_points(tmp_path))
     assert any("aligned to the reconstruction's points alone" in note for note in placed.notes)
     for found, true in zip(placed.cameras, cameras, strict=True):
         assert degrees_between(found.world_from_cam, true.world_from_cam) < 1

@@ -35,7 +35,7 @@ from mistyle.solver.photometry.record import (
     unchanged,
     with_gains,
 )
-from mistyle.solver.photometry.solve import Response, _with_exif, solve_photometry
+from mistyle.solver.photometry.solve import PointSamples, Response, _with_exif, solve_photometry
 
 SIDE, VIEWS, TEXELS = 112, 24, 64
 LEVELS, OBSERVATIONS, ATLAS = 8_000, 80_000, 200  # of usually 40,000, 200,000 and 320
@@ -190,6 +190,32 @@ def test_contrast_finds_exposures_under_veiling_light(scene):
     assert np.abs(solved.veil).max() > 0
     assert np.abs(solved.exposure - exposure).max() < 0.06
     assert solved.veil[3, 0].mean() == pytest.approx(0.12, abs=0.03)
+
+
+def test_reflections_of_a_common_light_are_not_taken_for_exposures(rng):
+    """Points of a ball whose bright side reflects more: pictures from that side are not exposed longer."""
+    points, each, pictures = 600, 8, 16
+    normal, view = (rng.normal(size=(n, 3)) for n in (points, pictures))
+    normal, view = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, view))
+    seen = np.argsort(-(normal @ view.T), axis=1)[:, :each]
+    point, picture = np.repeat(np.arange(points), each), seen.ravel()
+    cosine = (normal[point] * view[picture]).sum(axis=1)
+    point, picture, cosine = (a[cosine > 0.4] for a in (point, picture, cosine))
+    mirrored = 2 * cosine[:, None] * normal[point] - view[picture]
+    slant = 1 - cosine
+    albedo = rng.uniform(0.1, 0.5, (points, 3))[point]
+    shine = 0.05 * (1 + mirrored[:, :1]) * (1 + 24 * slant[:, None] ** 5)
+    exposure = rng.uniform(-0.5, 0.5, pictures)
+    exposure -= exposure.mean()
+    rgb = (albedo + shine) * np.exp(exposure)[picture, None]
+    region = (np.floor(2 * normal[point]) @ [100, 10, 1]).astype(int)
+    patch = np.unique(region, return_inverse=True)[1]
+    x = np.zeros((len(point), 2))
+    samples = PointSamples(rgb, picture, point, patch, patch, slant, view[picture], mirrored, x, pictures, 1)
+    found, (before, reflected, after) = photometry._levels(samples, full=True)
+    gain = found.gain.mean(axis=1)
+    assert np.abs(gain - gain.mean() - exposure).max() < 0.02
+    assert after < 0.2 * reflected and after < 0.2 * before
 
 
 def test_exif_is_a_prior_of_its_own_width():

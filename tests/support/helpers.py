@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,3 +37,11 @@ def data(path: str) -> Path:
     if not found.exists():
         pytest.skip(f"{NO_DATA}: {path}")
     return found
+
+
+def point_cloud(file: Path, points: np.ndarray) -> None:
+    """A PLY as nerfstudio writes it: vertices with colours, no faces."""
+    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "".join(f"property uint8 {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
+    file.write_text(header + "".join(f"{x:8f} {y:8f} {z:8f} 1 2 3\n" for x, y, z in points))

@@ -43,6 +43,8 @@ from mistyle.solver.settings import measured_subsamples
 if TYPE_CHECKING:
     from mistyle.solver.recover import Recovered
 
+SparsePoints = Float[np.ndarray, "n 3"]
+
 PICTURED = 1600  # pixels along the longer side of the pictures that the report shows, at most
 TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
 
@@ -101,6 +103,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     from mistyle.fitting.report.material import material_report, write_summary
     from mistyle.io.cameras.captures import read_shots
     from mistyle.io.cameras.reading_notes import reading_notes
+    from mistyle.io.cameras.sparse_points import sparse_points
     from mistyle.jobs.run_record import old_report
 
     files = input_files(job.mesh)
@@ -120,8 +123,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         )
         check_material(needed, pixels_of(captures), *size_of(asset))
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
-        seen = camera_inputs(job, captures, shots)
-        placed = run.record("cameras", ["mesh"], seen, lambda r: place(job, asset, captures, shots, r))
+        sparse = sparse_points(job.references) if s.references.align else None
+        seen = camera_inputs(job, captures, shots, sparse)
+        placed = run.record("cameras", ["mesh"], seen, lambda r: place(job, asset, captures, shots, r, sparse))
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
@@ -149,16 +153,14 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         return deliver(job, progress) | write_summary(results, run)
 
 
-def camera_inputs(job: MaterialJob, captures: Captures, shots: Sequence[Any]) -> list[Any]:
+def camera_inputs(job: MaterialJob, captures: Captures, shots: Sequence[Any], sparse: SparsePoints | None) -> list[Any]:
     """What the placed cameras and the pictures depend on, beside the mesh."""
     from mistyle.deliver.colour import key_of
-    from mistyle.io.cameras.sparse_points import sparse_points
 
     s = job.settings
     pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
-    points = sparse_points(job.references) if s.references.align else None
     seen_as = [[shot.pixels for shot in shots], [vars(c) for c in captures.cameras], captures.lights]
-    return [pictures, *seen_as, points, s.references, s.seed, key_of(s.colour)]
+    return [pictures, *seen_as, sparse, s.references, s.seed, key_of(s.colour)]
 
 
 def explained_pictures(
@@ -219,13 +221,19 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
     return tuple(result)
 
 
-def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Placed:
-    """The cameras in working space: unchanged, converted from the mesh's units, or aligned and refined on request; and
-    the overlap of the mesh's outlines with the masks."""
+def place(
+    job: MaterialJob,
+    asset: Asset,
+    captures: Captures,
+    shots: Sequence[Any],
+    report: Report,
+    sparse: SparsePoints | None = None,
+) -> Placed:
+    """The cameras in working space: unchanged, converted from the mesh's units, or aligned (to the points
+    `sparse` of a reconstruction, if given) and refined on request; and the overlap of outlines and masks."""
     from mistyle.geometry.similarity import Y_FROM_Z, moved, upright
     from mistyle.io.cameras.captures import camera_space, outline_of, silhouette
     from mistyle.io.cameras.reading_notes import matte_note
-    from mistyle.io.cameras.sparse_points import sparse_points
     from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
     from mistyle.solver.cameras.outline_check import check_outlines, overlap_notes
 
@@ -234,7 +242,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     figures: dict[str, float] = {}
     notes: list[str] = []
     inner: list[float] = []
-    masks, sparse = None, sparse_points(job.references) if chosen.align else None
+    masks = None
     if chosen.align or chosen.refine_poses:
         try:
             masks = [silhouette(shot, inner.append) for shot in shots]

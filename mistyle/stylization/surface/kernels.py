@@ -301,31 +301,36 @@ def search(
     """
     i = dr.arange(dj.UInt, table.count)
     cost = _cost(dj, table, exemplar, field, targets, prices)
+    other = field if also is None else also
+    slots, probes = whole(dj, np.array(FOLLOW)), floats(dj, PROBES)
+    follow, probe = 2, 2 + len(FOLLOW)
 
-    def better(best: tuple[Any, ...], page: Any, x: Any, y: Any) -> tuple[Any, ...]:
+    def candidate(k: Any, best: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+        """Own place, `also`, the neighbours' continued places, then steps from the best so far."""
+        slot = dr.gather(dj.UInt, slots, k - follow, (k >= follow) & (k < probe))
+        step = dr.gather(dj.Array2f, probes, k - probe, k >= probe)
+        place = best[1], best[2] + step[0], best[3] + step[1]
+        for least, one in (
+            (probe, continued(dj, table, exemplar, field, i * 25 + slot)),
+            (follow, (other.page, other.x, other.y)),
+            (1, (field.page, field.x, field.y)),
+        ):
+            place = tuple(dr.select(k < least, new, old) for new, old in zip(one, place, strict=True))
+        return place
+
+    def body(k: Any, *best: Any) -> tuple[Any, ...]:
+        page, x, y = candidate(k, best)
         x, y = _inside(dj, exemplar, page, x, y)
         price = cost(page, x, y)
         take = price < best[0]
-        return tuple(dr.select(take, new, old) for new, old in zip((price, page, x, y), best, strict=True))
+        better = (dr.select(take, new, old) for new, old in zip((price, page, x, y), best, strict=True))
+        return (k + 1, *better)
 
-    best: tuple[Any, ...] = (cost(field.page, field.x, field.y), field.page, field.x, field.y)
-    if also is not None:
-        best = better(best, also.page, also.x, also.y)
-    slots = whole(dj, np.array(FOLLOW))
-    probes = floats(dj, PROBES)
-
-    def follow(k: Any, *best: Any) -> tuple[Any, ...]:
-        page, x, y = continued(dj, table, exemplar, field, i * 25 + dr.gather(dj.UInt, slots, k))
-        return (k + 1, *better(best, page, x, y))
-
-    def probe(k: Any, *best: Any) -> tuple[Any, ...]:
-        step = dr.gather(dj.Array2f, probes, k)
-        return (k + 1, *better(best, best[1], best[2] + step[0], best[3] + step[1]))
-
-    best = dr.while_loop((dj.UInt(0), *best), lambda k, *rest: k < len(FOLLOW), follow)[1:]
-    best = dr.while_loop((dj.UInt(0), *best), lambda k, *rest: k < len(PROBES), probe)[1:]
-    dr.eval(best)
-    price, page, x, y = best
+    # One loop for all candidates: Dr.Jit traces and LLVM compiles the cost once.
+    last = probe + len(PROBES)
+    start = (dj.UInt(0), dr.full(dj.Float, np.inf, table.count), field.page, field.x, field.y)
+    _, price, page, x, y = dr.while_loop(start, lambda k, *best: k < last, body)
+    dr.eval(price, page, x, y)
     return price, FieldArrays(page, x, y)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import point_cloud
 from scipy.spatial.transform import Rotation
 
 from mistyle.core.camera import px_from_world
@@ -17,14 +18,6 @@ SIZE = (48, 64)
 APPLIED = [[0.0, 2, 0, 0.3], [0, 0, 2, -1], [2, 0, 0, 0.5]]
 
 
-def cloud(file: Path, points: np.ndarray) -> None:
-    """As nerfstudio writes it: vertices with colours, no faces."""
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz")
-    header += "".join(f"property uint8 {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
-    file.write_text(header + "".join(f"{x:8f} {y:8f} {z:8f} 1 2 3\n" for x, y, z in points))
-
-
 def nerfstudio(folder: Path, points: np.ndarray, **changes) -> np.ndarray:
     """A folder of one view; returns its matrix as stored (OpenGL axes)."""
     stored = np.eye(4)
@@ -35,7 +28,7 @@ def nerfstudio(folder: Path, points: np.ndarray, **changes) -> np.ndarray:
     folder.mkdir(exist_ok=True)
     (folder / "transforms.json").write_text(json.dumps(tree))
     write_png(folder / "a.png", np.full((*SIZE, 3), 0.5, np.float32))
-    cloud(folder / "sparse_pc.ply", points)
+    point_cloud(folder / "sparse_pc.ply", points)
     return stored
 
 
@@ -61,7 +54,7 @@ def test_a_folder_that_was_moved_keeps_its_points(tmp_path, rng, name):
 
 @pytest.mark.parametrize("name", ["absent.ply", "../outside.ply", "", None, 7])
 def test_points_that_are_not_there_or_elsewhere_are_not_read(tmp_path, rng, name):
-    cloud(tmp_path / "outside.ply", rng.normal(size=(5, 3)))
+    point_cloud(tmp_path / "outside.ply", rng.normal(size=(5, 3)))
     nerfstudio(tmp_path / "scene", rng.normal(size=(5, 3)), ply_file_path=name)
     assert sparse_points(tmp_path / "scene") is None
 
