@@ -1,6 +1,7 @@
 """What holds for every test: the LLVM that the set-up found, a seeded generator, and no silent skips in CI."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,9 @@ environment.use_llvm()
 # Tests import torch before a job tells OpenMP how to wait (mistyle/process/cores.py): threads that spin on two busy
 # cores made a small network's operations eight times slower.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# Compiled modules are kept: each of the many processes that tests start would compile the package anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 # Read when Ray is imported: the engine sets it, but here tests may import Ray before the engine does.
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 settings.register_profile("mistyle", deadline=None, derandomize=True, database=None)

@@ -43,7 +43,7 @@ from mistyle.solver.settings import measured_subsamples
 if TYPE_CHECKING:
     from mistyle.solver.recover import Recovered
 
-SparsePoints = Float[np.ndarray, "n 3"]
+Sparse = Float[np.ndarray, "n 3"] | None  # points of a reconstruction, if it has some
 
 PICTURED = 1600  # pixels along the longer side of the pictures that the report shows, at most
 TWICE = 1e9  # bytes of a picture's samples that are kept where two models are rendered from them
@@ -153,7 +153,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         return deliver(job, progress) | write_summary(results, run)
 
 
-def camera_inputs(job: MaterialJob, captures: Captures, shots: Sequence[Any], sparse: SparsePoints | None) -> list[Any]:
+def camera_inputs(job: MaterialJob, captures: Captures, shots: Sequence[Any], sparse: Sparse) -> list[Any]:
     """What the placed cameras and the pictures depend on, beside the mesh."""
     from mistyle.deliver.colour import key_of
 
@@ -222,12 +222,7 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
 
 
 def place(
-    job: MaterialJob,
-    asset: Asset,
-    captures: Captures,
-    shots: Sequence[Any],
-    report: Report,
-    sparse: SparsePoints | None = None,
+    job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report, sparse: Sparse = None
 ) -> Placed:
     """The cameras in working space: unchanged, converted from the mesh's units, or aligned (to the points
     `sparse` of a reconstruction, if given) and refined on request; and the overlap of outlines and masks."""
@@ -239,10 +234,7 @@ def place(
 
     chosen = job.settings.references
     captures = upright(captures) if chosen.up == "z" else captures
-    figures: dict[str, float] = {}
-    notes: list[str] = []
-    inner: list[float] = []
-    masks = None
+    masks, notes, inner, figures = None, list[str](), list[float](), dict[str, float]()
     if chosen.align or chosen.refine_poses:
         try:
             masks = [silhouette(shot, inner.append) for shot in shots]

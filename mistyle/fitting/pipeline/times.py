@@ -13,7 +13,7 @@ PER_REPORT_RAY = 7e-8  # a sample of the report's pictures
 REPORTED, PER_SHOWN_PIXEL = 8, 4e-7  # pictures that the report shows beside their prediction, and a pixel of these
 
 LIGHT_SECONDS = 15.0  # of an unknown light
-EXPLAINED, PER_EXPLAINED = 5, 0.65  # of exposures that are solved with a material, and of a picture of these
+EXPLAINED, PER_EXPLAINED = 3, 0.3  # of exposures that are solved with a material, and of a picture of these
 
 
 def reading_seconds(shots: Sequence[Any], sizes: Sequence[int]) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import Any, no_type_check
 
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.process import stopping
@@ -32,6 +32,7 @@ LLVM_HELP = (
 class _AtFirstUse(ModuleType):
     """A module that is imported when something of it is used. Dr.Jit looks for LLVM when it is imported."""
 
+    @no_type_check  # checks of annotations under pytest would cost more than everything that the kernels' tracing does
     def __getattr__(self, name: str) -> Any:
         if name != "module":
             return getattr(self.module, name)

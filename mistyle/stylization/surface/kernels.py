@@ -301,34 +301,25 @@ def search(
     """
     i = dr.arange(dj.UInt, table.count)
     cost = _cost(dj, table, exemplar, field, targets, prices)
-    other = field if also is None else also
+    own, other = ((f.page, f.x, f.y) for f in (field, field if also is None else also))
     slots, probes = whole(dj, np.array(FOLLOW)), floats(dj, PROBES)
-    follow, probe = 2, 2 + len(FOLLOW)
+    follow, probe, last = np.cumsum([2, len(FOLLOW), len(PROBES)]).tolist()
 
-    def candidate(k: Any, best: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-        """Own place, `also`, the neighbours' continued places, then steps from the best so far."""
+    def choose(take: Any, new: tuple[Any, ...], old: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(dr.select(take, a, b) for a, b in zip(new, old, strict=True))
+
+    # One loop over all candidates, so that Dr.Jit traces and LLVM compiles the cost once.
+    def body(k: Any, *best: Any) -> tuple[Any, ...]:
         slot = dr.gather(dj.UInt, slots, k - follow, (k >= follow) & (k < probe))
         step = dr.gather(dj.Array2f, probes, k - probe, k >= probe)
-        place = best[1], best[2] + step[0], best[3] + step[1]
-        for least, one in (
-            (probe, continued(dj, table, exemplar, field, i * 25 + slot)),
-            (follow, (other.page, other.x, other.y)),
-            (1, (field.page, field.x, field.y)),
-        ):
-            place = tuple(dr.select(k < least, new, old) for new, old in zip(one, place, strict=True))
-        return place
-
-    def body(k: Any, *best: Any) -> tuple[Any, ...]:
-        page, x, y = candidate(k, best)
+        beside = continued(dj, table, exemplar, field, i * 25 + slot)
+        place = choose(k < probe, beside, (best[1], best[2] + step[0], best[3] + step[1]))
+        page, x, y = choose(k < 1, own, choose(k < follow, other, place))
         x, y = _inside(dj, exemplar, page, x, y)
         price = cost(page, x, y)
-        take = price < best[0]
-        better = (dr.select(take, new, old) for new, old in zip((price, page, x, y), best, strict=True))
-        return (k + 1, *better)
+        return (k + 1, *choose(price < best[0], (price, page, x, y), best))
 
-    # One loop for all candidates: Dr.Jit traces and LLVM compiles the cost once.
-    last = probe + len(PROBES)
-    start = (dj.UInt(0), dr.full(dj.Float, np.inf, table.count), field.page, field.x, field.y)
+    start = (dj.UInt(0), dr.full(dj.Float, np.inf, table.count), *own)
     _, price, page, x, y = dr.while_loop(start, lambda k, *best: k < last, body)
     dr.eval(price, page, x, y)
     return price, FieldArrays(page, x, y)
