@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,7 +23,8 @@ from mistyle.core.paths import scenes
 
 def plan_in(folder: Path):
     jobs = folder.parent / "jobs.toml"
-    jobs.write_text(BATCH.format(mesh=scenes() / "demo.obj", style=scenes() / "demo_style.png"))
+    text = BATCH.format(mesh=scenes() / "demo.obj", style=scenes() / "demo_style.png")
+    jobs.write_text(re.sub("report = {.*?}", 'report = { detail = "none" }', text, count=1))
     return planned(jobs, folder, Choices(workers=2, threads=1))
 
 
