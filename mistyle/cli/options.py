@@ -1,6 +1,7 @@
 """Command line options that several verbs share, and their conversion to settings."""
 
 import argparse
+import difflib
 import re
 import sys
 import textwrap
@@ -21,10 +22,15 @@ NUMBER = re.compile(r"-\.?\d")  # begins a negative number, also one in a list o
 
 
 class VerbParser(argparse.ArgumentParser):
-    """A parser, and that of its verbs, whose options take values that begin with a dash."""
+    """A parser, and that of its verbs, whose options take values that begin with a dash. What a verb does not know ends
+    with a sentence instead of the usage of all verbs."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        return super().parse_known_args(with_values(self, sys.argv[1:] if args is None else args), namespace)
+        words = with_values(self, sys.argv[1:] if args is None else args)
+        found, unknown = super().parse_known_args(words, namespace)
+        if unknown and self._subparsers is None:
+            self.exit(2, f"{self.prog}: {_about_unknown(self, unknown)} (`{self.prog} --help` lists all)\n")
+        return found, unknown
 
 
 def with_values(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
@@ -42,6 +48,16 @@ def with_values(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[s
         else:
             result.append(word)
     return result
+
+
+def _about_unknown(parser: argparse.ArgumentParser, words: Sequence[str]) -> str:
+    """What is wrong with words that the parser does not know, and the nearest option."""
+    name = next((word.partition("=")[0] for word in words if word.startswith("-")), None)
+    if name is None:
+        return f"found '{' '.join(words)}' beside the arguments that it takes; quote names with spaces"
+    near = difflib.get_close_matches(name, list(parser._option_string_actions), n=1, cutoff=0.7)
+    settings = "; settings are given with --set" if "--set" in parser._option_string_actions else ""
+    return f"there is no option '{name}'" + (f"; did you mean '{near[0]}'?" if near else settings)
 
 
 def _dashed(word: str, choices: Iterable[Any] | None) -> bool:

@@ -102,6 +102,13 @@ def test_unknown_verbs_are_refused():
     assert stopped.value.code == 2
 
 
+def test_words_that_are_too_many_are_named(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["stylize", "my", "chair.glb", "b.png", "-o", "x"])
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err.startswith("mistyle stylize: found 'b.png' beside the arguments that it takes")
+
+
 def verbs(top, name=""):
     """Every verb's parser by name, those of verbs of verbs too."""
     for action in top._actions:
@@ -114,6 +121,25 @@ def verbs(top, name=""):
 
 def of_one_value(verb):
     return [(action, text) for action in verb._actions if action.nargs is None for text in action.option_strings]
+
+
+@pytest.mark.parametrize(("name", "verb"), list(verbs(parser())))
+def test_unknown_options_name_the_nearest(name, verb, capsys):
+    """Two letters exchanged in every long option of every verb, and an option that resembles none."""
+    if verb._subparsers is not None:
+        return
+    options = [text for text in verb._option_string_actions if len(text) > 6 and text != "--help"]
+    for option in [*options, "--zzzzzz"]:
+        wrong = option[:4] + option[5] + option[4] + option[6:]
+        if wrong in verb._option_string_actions:
+            continue
+        with pytest.raises(SystemExit) as stopped:
+            verb.parse_known_args([wrong])
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2
+        required = "the following arguments are required" in said
+        assert required or (said.startswith(f"mistyle {name}: there is no option '{wrong}'") and said.count("\n") == 1)
+        assert required or ("did you mean '--" in said) == (option in options)
 
 
 @pytest.mark.parametrize(("name", "verb"), list(verbs(parser())))

@@ -303,7 +303,8 @@ def source_of(path: Path) -> tuple[Kind, Path]:
             return "realityscan", path
         foreign = [] if camera_files else foreign_files(path)[:1]
         if not camera_files and not foreign:
-            raise refuse(path, "none of these in the folder", EXPECTED, "Hand in the folder with the cameras")
+            fix = "Hand in the folder with the cameras; COLMAP, Meshroom or RealityScan find them from the pictures"
+            raise refuse(path, "none of these in the folder", EXPECTED, fix)
         path = (camera_files or foreign)[0]
     elif not path.is_file():
         raise refuse(path, "nothing", EXPECTED, "Check the path")
