@@ -458,5 +458,9 @@ def _test(options: argparse.Namespace) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code; every expected failure becomes one sentence on stderr."""
-    options = parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if not words:
+        parser().print_help()
+        return UsageError.exit_code
+    options = parser().parse_args(words)
     return exits.run(options.command, options)

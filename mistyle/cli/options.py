@@ -7,7 +7,7 @@ import sys
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from mistyle.core import names
 from mistyle.core.errors import UsageError
@@ -22,15 +22,18 @@ NUMBER = re.compile(r"-\.?\d")  # begins a negative number, also one in a list o
 
 
 class VerbParser(argparse.ArgumentParser):
-    """A parser, and that of its verbs, whose options take values that begin with a dash. What a verb does not know ends
-    with a sentence instead of the usage of all verbs."""
+    """A parser, and that of its verbs, whose options take values that begin with a dash. A wrong command line ends with
+    a sentence instead of the usage, which is long."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = with_values(self, sys.argv[1:] if args is None else args)
         found, unknown = super().parse_known_args(words, namespace)
         if unknown and self._subparsers is None:
-            self.exit(2, f"{self.prog}: {_about_unknown(self, unknown)} (`{self.prog} --help` lists all)\n")
+            self.error(_about_unknown(self, unknown))
         return found, unknown
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (`{self.prog} --help` lists all)\n")
 
 
 def with_values(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:

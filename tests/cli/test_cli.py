@@ -102,6 +102,11 @@ def test_unknown_verbs_are_refused():
     assert stopped.value.code == 2
 
 
+def test_without_words_the_help_is_printed(capsys):
+    assert main([]) == 2
+    assert "commands" in capsys.readouterr().out
+
+
 def test_words_that_are_too_many_are_named(capsys):
     with pytest.raises(SystemExit) as stopped:
         main(["stylize", "my", "chair.glb", "b.png", "-o", "x"])
