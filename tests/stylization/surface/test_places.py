@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from helpers import fixed_surface
+from scipy.spatial import KDTree
 from test_surface import dented_ball, mesh_of, solved, strokes
 
 from mistyle.stylization.surface import kernels, samples, synthesis
@@ -51,6 +52,37 @@ def test_vibrations_step_where_the_surface_is_narrow(dj):
     upper = points.positions[:, 1] > 0
     assert np.mean((first > 0) == upper) > 0.98 or np.mean((first > 0) == ~upper) > 0.98
     assert np.abs(first).min() > 0.1 * np.abs(first).max() or np.percentile(np.abs(first), 5) > 0.5
+
+
+@pytest.mark.parametrize("lopsided", [False, True])
+def test_mirror_images_have_one_colour(dj, lopsided):
+    """A body with two horns about an axis that is none of the world's; or with two humps that no plane mirrors."""
+    turn, height = np.meshgrid(np.arange(64) * 2 * np.pi / 64, np.linspace(-1, 1, 60))
+    ring = np.sqrt(np.maximum(1 - height**2, 0.003))
+    out = np.stack([ring * np.cos(turn), height, 0.8 * ring * np.sin(turn)], -1).reshape(-1, 3)
+    bumps, wide = [(-0.6, 0.7, 0.2), (0.6, 0.7, 0.2)], 0.06
+    if lopsided:
+        bumps, wide = [(1, 0.2, 0.4), (-0.3, 0.9, -0.6)], 0.3
+    grown = 1 + sum(np.exp(-((out - at) ** 2).sum(axis=1) / wide) for at in bumps)
+    angle = np.radians(30)
+    axes = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    positions = (out * grown[:, None] * [1.0, 1.0, 1.3]) @ axes
+    quads = [
+        (r * 64 + c, r * 64 + (c + 1) % 64, (r + 1) * 64 + c, (r + 1) * 64 + (c + 1) % 64)
+        for r in range(59)
+        for c in range(64)
+    ]
+    faces = np.array([face for a, b, c, d in quads for face in ((a, c, b), (b, c, d))])
+    mesh = mesh_of(positions, faces, positions)
+    points = samples.spread(mesh, samples.sample_normals(mesh), 2500, np.random.default_rng(0), dj)
+    tangent = samples.unit(np.cross(points.normals, [0.3, 0.5, 0.8])).astype(np.float32)
+    level = samples.with_tables(points, tangent, np.ones(len(tangent), np.float32), dj)
+    fields = places.place_fields(level, np.ones(len(tangent), np.float32))
+    centred = points.positions @ axes.T * [-1, 1, 1]
+    twin = KDTree(points.positions @ axes.T).query(centred)[1]
+    alike = [np.corrcoef(field, field[twin])[0, 1] for field in fields.T]
+    assert (places.mirrored(level).nnz == 0) == lopsided
+    assert min(alike) < 0.5 if lopsided else min(alike) > 0.9
 
 
 def test_the_painting_of_a_ball_holds_no_light():

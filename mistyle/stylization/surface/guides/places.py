@@ -2,20 +2,23 @@
 
 The lowest Laplacian eigenvectors change where the surface is narrow or creased and are nearly constant on its parts. So
 an ear, a leg or a lid has its own colour. Their components explained by light (surface direction, openness) are
-removed, so that the albedo has no shading.
+removed, so that the albedo has no shading. Where the shape is its own mirror image, so are they: both horns of a head
+have one colour.
 """
 
 import numpy as np
 from jaxtyping import Float
 from scipy.sparse import csr_matrix, diags, identity
+from scipy.spatial import KDTree
 
-from mistyle.stylization.surface.samples import Level
+from mistyle.stylization.surface.samples import Level, workers
 
 FIELDS = 3  # one for lightness, two for the axes of chroma
 MODES = 24  # candidate eigenvectors for the fields
 FIRM = 0.45  # least share of an eigenvector that must remain without the light's component
 CONCAVE = 8.0  # decay of two neighbours' weight per radian of a concave crease
 SHIFT = 1e-5  # keeps the factorised matrix regular; far below the first eigenvalue
+NEAR, ALIKE, SHARE = 2.0, 0.7, 0.9  # of a mirror image: spacings to a point, cosine of their normals, share of points
 TURNED = 0.5  # height of the normal from which a point counts as facing up (or down)
 
 
@@ -51,6 +54,9 @@ def laplacian_modes(level: Level, count: int) -> Float[np.ndarray, "n k"]:
     bound = csr_matrix((weight.reshape(-1), (rows, neighbour.reshape(-1))), shape=(size, size))
     # Disconnected pieces of the mesh get minimal weights, so that the lowest vectors are constant on each.
     bound = (bound + bound.T) / 2 + loose(positions)
+    # Twins weigh as much as a point's neighbours together; with more, pairs in deep creases would be their own parts.
+    inner = diags(np.sqrt(np.asarray(bound.sum(axis=1))[:, 0]))
+    bound = bound + inner @ mirrored(level) @ inner
     degree = np.asarray(bound.sum(axis=1))[:, 0]
     scale = diags(1 / np.sqrt(degree))
     laplacian = (identity(size) - scale @ bound @ scale).tocsc()
@@ -64,13 +70,33 @@ def laplacian_modes(level: Level, count: int) -> Float[np.ndarray, "n k"]:
 
 def loose(positions: Float[np.ndarray, "n 3"]) -> csr_matrix:
     """Small weights between points near in space, independent of the surface's side."""
-    from scipy.spatial import KDTree
-
     size, reach = len(positions), min(8, len(positions))
     index = KDTree(positions).query(positions, k=reach)[1].reshape(size, reach)
     rows = np.repeat(np.arange(size), reach)
     bonds = csr_matrix((np.full(rows.size, 1e-3), (rows, index.reshape(-1))), shape=(size, size))
     return (bonds + bonds.T) / 2
+
+
+def mirrored(level: Level) -> csr_matrix:
+    """Pairs of points that are mirror images, if the shape has an upright plane of symmetry; else none.
+
+    The plane contains the centroid. Its normal is the x or z axis or a horizontal principal axis.
+    """
+    positions, normals = level.points.positions.astype(np.float64), level.points.normals.astype(np.float64)
+    centred = positions - positions.mean(axis=0)
+    axes = np.linalg.eigh(np.cov(centred[:, [0, 2]].T))[1].T
+    planes = [np.array([x, 0.0, z]) for x, z in (*np.eye(2), *axes)]
+    size, tree = len(positions), KDTree(centred)
+    best, twin = SHARE, np.zeros(0, np.int64)
+    for plane in planes:
+        away, found = tree.query(centred - 2 * np.outer(centred @ plane, plane), workers=workers())
+        turned = normals - 2 * np.outer(normals @ plane, plane)
+        fits = (away < NEAR * level.points.spacing) & ((turned * normals[found]).sum(axis=1) > ALIKE)
+        if fits.mean() > best:
+            best, twin = fits.mean(), np.where(fits, found, np.arange(size))
+    rows = np.flatnonzero(twin != np.arange(size)) if len(twin) else twin
+    bonds = csr_matrix((np.full(len(rows), 0.5), (rows, twin[rows])), shape=(size, size))
+    return bonds + bonds.T
 
 
 def place_fields(level: Level, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
