@@ -32,7 +32,7 @@ LLVM_HELP = (
 class _AtFirstUse(ModuleType):
     """A module that is imported when something of it is used. Dr.Jit looks for LLVM when it is imported."""
 
-    @no_type_check  # checks of annotations under pytest would cost more than everything that the kernels' tracing does
+    @no_type_check  # called for every operation that is traced: pytest's check of annotations would take most of it
     def __getattr__(self, name: str) -> Any:
         if name != "module":
             return getattr(self.module, name)
