@@ -33,23 +33,29 @@ def test_no_light_explains_the_places(ball_levels):
     assert np.abs(np.corrcoef(fields.T) - np.eye(3)).max() < 0.7  # three different fields
 
 
+def level_on(positions, normals, grid, count, dj):
+    """Samples on a surface of rows of points, each closed to a ring."""
+    rows, columns = grid
+    quads = [
+        (r * columns + c, r * columns + (c + 1) % columns, (r + 1) * columns + c, (r + 1) * columns + (c + 1) % columns)
+        for r in range(rows - 1)
+        for c in range(columns)
+    ]
+    faces = np.array([face for a, b, c, d in quads for face in ((a, c, b), (b, c, d))])
+    mesh = mesh_of(positions, faces, normals)
+    points = samples.spread(mesh, samples.sample_normals(mesh), count, np.random.default_rng(0), dj)
+    tangent = samples.unit(np.cross(points.normals, [0.3, 0.5, 0.8])).astype(np.float32)
+    return samples.with_tables(points, tangent, np.ones(len(tangent), np.float32), dj)
+
+
 def test_vibrations_step_where_the_surface_is_narrow(dj):
     # Two balls that touch in a narrow neck: the lowest vibration has one sign on each.
     turn, height = np.meshgrid(np.arange(48) * 2 * np.pi / 48, np.linspace(-1.95, 1.95, 80))
     radius = np.sqrt(np.maximum(1 - (np.abs(height) - 1) ** 2, 0.01))
     positions = np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], -1).reshape(-1, 3) / 2
-    quads = [
-        (r * 48 + c, r * 48 + (c + 1) % 48, (r + 1) * 48 + c, (r + 1) * 48 + (c + 1) % 48)
-        for r in range(79)
-        for c in range(48)
-    ]
-    faces = np.array([face for a, b, c, d in quads for face in ((a, c, b), (b, c, d))])
-    mesh = mesh_of(positions, faces, positions - np.sign(positions[:, 1:2]) * np.array([0, 0.5, 0]))
-    points = samples.spread(mesh, samples.sample_normals(mesh), 3000, np.random.default_rng(0), dj)
-    tangent = samples.unit(np.cross(points.normals, [0.3, 0.5, 0.8])).astype(np.float32)
-    level = samples.with_tables(points, tangent, np.ones(len(tangent), np.float32), dj)
+    level = level_on(positions, positions - np.sign(positions[:, 1:2]) * np.array([0, 0.5, 0]), (80, 48), 3000, dj)
     first = places.laplacian_modes(level, 4)[:, 0]
-    upper = points.positions[:, 1] > 0
+    upper = level.points.positions[:, 1] > 0
     assert np.mean((first > 0) == upper) > 0.98 or np.mean((first > 0) == ~upper) > 0.98
     assert np.abs(first).min() > 0.1 * np.abs(first).max() or np.percentile(np.abs(first), 5) > 0.5
 
@@ -67,19 +73,10 @@ def test_mirror_images_have_one_colour(dj, lopsided):
     angle = np.radians(30)
     axes = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     positions = (out * grown[:, None] * [1.0, 1.0, 1.3]) @ axes
-    quads = [
-        (r * 64 + c, r * 64 + (c + 1) % 64, (r + 1) * 64 + c, (r + 1) * 64 + (c + 1) % 64)
-        for r in range(59)
-        for c in range(64)
-    ]
-    faces = np.array([face for a, b, c, d in quads for face in ((a, c, b), (b, c, d))])
-    mesh = mesh_of(positions, faces, positions)
-    points = samples.spread(mesh, samples.sample_normals(mesh), 2500, np.random.default_rng(0), dj)
-    tangent = samples.unit(np.cross(points.normals, [0.3, 0.5, 0.8])).astype(np.float32)
-    level = samples.with_tables(points, tangent, np.ones(len(tangent), np.float32), dj)
-    fields = places.place_fields(level, np.ones(len(tangent), np.float32))
-    centred = points.positions @ axes.T * [-1, 1, 1]
-    twin = KDTree(points.positions @ axes.T).query(centred)[1]
+    level = level_on(positions, positions, (60, 64), 2500, dj)
+    fields = places.place_fields(level, np.ones(len(level.directed), np.float32))
+    upright = level.points.positions @ axes.T
+    twin = KDTree(upright).query(upright * [-1, 1, 1])[1]
     alike = [np.corrcoef(field, field[twin])[0, 1] for field in fields.T]
     assert (places.mirrored(level).nnz == 0) == lopsided
     assert min(alike) < 0.5 if lopsided else min(alike) > 0.9

@@ -87,14 +87,14 @@ def mirrored(level: Level) -> csr_matrix:
     axes = np.linalg.eigh(np.cov(centred[:, [0, 2]].T))[1].T
     planes = [np.array([x, 0.0, z]) for x, z in (*np.eye(2), *axes)]
     size, tree = len(positions), KDTree(centred)
-    best, twin = SHARE, np.zeros(0, np.int64)
+    best, twin = SHARE, np.arange(size)
     for plane in planes:
         away, found = tree.query(centred - 2 * np.outer(centred @ plane, plane), workers=workers())
         turned = normals - 2 * np.outer(normals @ plane, plane)
         fits = (away < NEAR * level.points.spacing) & ((turned * normals[found]).sum(axis=1) > ALIKE)
         if fits.mean() > best:
             best, twin = fits.mean(), np.where(fits, found, np.arange(size))
-    rows = np.flatnonzero(twin != np.arange(size)) if len(twin) else twin
+    rows = np.flatnonzero(twin != np.arange(size))
     bonds = csr_matrix((np.full(len(rows), 0.5), (rows, twin[rows])), shape=(size, size))
     return bonds + bonds.T
 
