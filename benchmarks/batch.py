@@ -6,14 +6,13 @@ minute. Every row begins with an empty folder and the same plan, except that thr
 the cores each against one job at a time with half of the cores (half of the jobs).
 """
 
-import os
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.common import arguments, finish
+from benchmarks.common import DATA, arguments, finish
 from mistyle.batch import engines
 from mistyle.batch.pipeline import Choices, planned, run_batch
 from mistyle.batch.plan import BatchPlan, write_plan
@@ -32,9 +31,8 @@ rig = { kind = "turntable", views = 4, resolution = 128 }, surface = { samples =
 
 def jobs(folder: Path, quick: bool, most: int = 4) -> Path:
     """The jobs file: every mesh in at most `most` styles (with --quick: seeds)."""
-    data = Path(os.environ.get("MISTYLE_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
-    meshes = [p for name in MESHES for p in sorted((data / "meshes").rglob(name))[:1]]
-    styles = [p for name in STYLES for p in sorted((data / "styles").glob(f"{name}*"))[:1]][:most]
+    meshes = [p for name in MESHES for p in sorted((DATA / "meshes").rglob(name))[:1]]
+    styles = [p for name in STYLES for p in sorted((DATA / "styles").glob(f"{name}*"))[:1]][:most]
     demo = scenes() / "demo.obj"
     if quick or not meshes or not styles:
         meshes, styles = [demo], [scenes() / "demo_style.png"]

@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 from mistyle.process.cores import cores
 
 T = TypeVar("T")
+ROOT = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("MISTYLE_DATA") or ROOT.parent / "shared" / "data")  # real meshes, pictures and weights
 PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"  # `python -c` of it is the command line
 
 
@@ -24,12 +26,18 @@ def arguments(description: str, argv: list[str] | None = None) -> argparse.Names
 
 def parser(description: str) -> argparse.ArgumentParser:
     """A parser of the options that every benchmark has, for benchmarks that have more."""
-    options = argparse.ArgumentParser(description=description)
+    options = argparse.ArgumentParser(prog=program(), description=description)
     options.add_argument("--quick", action="store_true", help="small sizes, only to see that it works")
     options.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the figures as JSON ('-': to stdout only)"
     )
     return options
+
+
+def program() -> str:
+    """The command of the benchmark that runs, for its usage."""
+    spec = sys.modules["__main__"].__spec__
+    return f"python -m {spec.name.removesuffix('.__main__')}" if spec is not None else Path(sys.argv[0]).name
 
 
 def timed(figures: dict[str, float], name: str, work: Callable[[], T]) -> T:

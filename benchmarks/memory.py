@@ -11,15 +11,13 @@ the constants of stylization/pipeline/budget.py and fitting/pipeline/budget.py c
 import argparse
 import hashlib
 import json
-import os
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import finish, run_mistyle
+from benchmarks.common import DATA, finish, run_mistyle
 
-DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 SPOT, BUNNY = DATA / "meshes/plain/spot.obj", DATA / "meshes/plain/stanford-bunny.obj"
 WAVE, STARS = DATA / "styles/great_wave.jpg", DATA / "styles/starry_night.jpg"
 FEW = ["--set", "fit.iterations1=3", "--set", "fit.iterations2=3", "--set", "report.frames=4"]

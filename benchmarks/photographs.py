@@ -36,10 +36,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks import recovery_pictures as drawing
-from benchmarks.common import finish, run_mistyle
-from benchmarks.material_metrics import map_errors
-from benchmarks.recovery_truth import data_folder, find_asset, truth
+from benchmarks.common import DATA, finish, run_mistyle
+from benchmarks.material_recovery import pictures as drawing
+from benchmarks.material_recovery.metrics import map_errors
+from benchmarks.material_recovery.truth import find_asset, truth
 from mistyle.atlas.texels import rasterise, start_maps
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.capture import Captures, in_memory, shrunk
@@ -89,7 +89,7 @@ def main() -> None:
 
 def large(place: Path, views: int, side: int) -> dict[str, float]:
     """Photographs made, read, predicted once as they are and averaged, and fitted to."""
-    mesh, folder = find_asset("waterbottle", data_folder()), place / "photographs"
+    mesh, folder = find_asset("waterbottle", DATA), place / "photographs"
     count = photograph(mesh, folder, views, (side, side))
     captures = read_captures(folder, saturation=0.99)
     asset = read_mesh(mesh)
@@ -159,7 +159,7 @@ def photograph(mesh: Path, folder: Path, views: int, size: tuple[int, int], radi
 
 def real_size(place: Path, options: argparse.Namespace) -> dict[str, float]:
     """The first passes of a fit to so many photographs within a budget: its peak, and the seconds of the whole."""
-    mesh, folder = find_asset("waterbottle", data_folder()), place / "real_photographs"
+    mesh, folder = find_asset("waterbottle", DATA), place / "real_photographs"
     size = (480, 640) if options.quick else (3000, 4000)
     views = min(4, max(1, options.pictures // 3))
     count = photograph(mesh, folder, views, size, (0.0, 0.0, 0.0), max(1, -(-options.pictures // (3 * views))))
@@ -280,7 +280,7 @@ def _prediction(mesh, captures: Captures) -> float:
 
 def strong(size: int) -> dict[str, float]:
     """The errors of fits to pictures that are finer than the texels, and to averages of them."""
-    known = truth(find_asset("suzanne", data_folder()), "suzanne", drawing.fibonacci(1, size)[0], "auto", True)
+    known = truth(find_asset("suzanne", DATA), "suzanne", drawing.fibonacci(1, size)[0], "auto", True)
     shots = drawing.one_at_a_time(drawing.fibonacci(16, FINEST * size))
     pictures = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=32)
     masks = [picture[..., 3] > 0.999 for picture in pictures]

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import arguments, finish
-from benchmarks.faults_corpus import glb, gltf_parts
+from benchmarks.faults.corpus import glb, gltf_parts
 
 RUNS, MOST, ENOUGH = 9, 41, 20.0
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.common import finish, timed
+from benchmarks.common import ROOT, finish, timed
 from mistyle.core.camera import rig
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.settings import RigSettings
@@ -28,7 +28,7 @@ from mistyle.stylization.pipeline import painting
 from mistyle.stylization.pipeline import start as stylize_start
 from mistyle.stylization.settings import Settings
 
-SCENES = Path(__file__).resolve().parents[1] / "scenes"
+SCENES = ROOT / "scenes"
 WINDOW = 10
 
 

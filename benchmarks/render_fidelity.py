@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.common import finish
+from benchmarks.common import DATA, finish
 from mistyle.core.camera import look_at
 from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Environment
@@ -34,7 +34,7 @@ ACES_OUT = np.array([[1.60475, -0.53108, -0.07367], [-0.10208, 1.10813, -0.00605
 def main() -> None:
     options = argparse.ArgumentParser(prog="python -m benchmarks.render_fidelity", description=__doc__)
     options.add_argument("--blender", default=os.environ.get("MISTYLE_BLENDER_PYTHON"), help="Python with bpy")
-    options.add_argument("--data", type=Path, default=Path(os.environ.get("MISTYLE_DATA", "../shared/data")))
+    options.add_argument("--data", type=Path, default=DATA)
     options.add_argument("--pictures", type=Path, help="folder for side-by-side pictures")
     options.add_argument("--only", help="part of the benchmark: helmet, demo, avocado or suzanne")
     options.add_argument("--quick", action="store_true", help="few samples, small pictures, one asset")

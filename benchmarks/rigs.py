@@ -9,19 +9,17 @@ one it overlaps most) and `.seconds`, `.seconds.cpu` (choosing the rig; reading 
 """
 
 import argparse
-import os
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import finish, timed
+from benchmarks.common import DATA, finish, timed
 from mistyle.core.camera import Camera, rig
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.settings import RigSettings
 from mistyle.geometry.next_best_view import candidate_cameras, overlaps, visit
 
-DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MESHES = {"spot": "spot", "teapot": "teapot", "bunny": "stanford-bunny", "armadillo": "armadillo"}
 QUICK = ("spot", "teapot")
 ATLAS = 1024

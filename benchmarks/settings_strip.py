@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from benchmarks.common import ROOT
 from mistyle.core.camera import rig
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.settings import RigSettings
@@ -25,7 +26,6 @@ from mistyle.stylization.pipeline import painting
 from mistyle.stylization.pipeline import start as stylize_start
 from mistyle.stylization.settings import Settings
 
-ROOT = Path(__file__).resolve().parents[1]
 STRIPS: dict[str, tuple[dict[str, Any], ...]] = {
     "stroke_scale": tuple({"stroke_scale": v} for v in (0.5, 1.0, 2.0, 4.0)),
     "form": tuple({"form": v} for v in (0.0, 0.5, 1.0)),

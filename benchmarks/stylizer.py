@@ -8,16 +8,14 @@ process, the mesh and the views included) and `250k.<part>` in seconds. --quick:
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.common import finish, peak_gb, timed
+from benchmarks.common import DATA, ROOT, finish, peak_gb, timed
 
-DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
-SCENES = Path(__file__).resolve().parents[1] / "scenes"
+SCENES = ROOT / "scenes"
 COUNTS = {"250k": 250_000, "1m": 1_000_000}
 
 

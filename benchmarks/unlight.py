@@ -8,12 +8,11 @@ how much of the shading was found; the same of views that show no light (`.none`
 """
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.common import arguments, finish
+from benchmarks.common import DATA, ROOT, arguments, finish
 from benchmarks.relief_start import silent, views_of
 from mistyle.core.asset import Picture
 from mistyle.core.image import luminance
@@ -26,9 +25,7 @@ from mistyle.stylization.pipeline import painting, sweep
 from mistyle.stylization.pipeline import start as stylize_start
 from mistyle.stylization.settings import Settings
 
-ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
-DATA = ROOT.parent / "shared" / "data" / "styles"
 
 
 def left(baked: Any, truth: Any, seen: np.ndarray) -> float:
@@ -68,7 +65,7 @@ def main() -> None:
     asset = read_mesh(SCENES / "demo.obj")
     styles = {"demo": SCENES / "demo_style.png"}
     if not chosen.quick:
-        styles |= {name: DATA / f"{name}.jpg" for name in ("great_wave", "starry_night", "the_scream")}
+        styles |= {name: DATA / "styles" / f"{name}.jpg" for name in ("great_wave", "starry_night", "the_scream")}
     figures: dict[str, float] = {}
     for name, path in styles.items():
         style = read_picture(path)

@@ -103,13 +103,14 @@ def _raise(message: str) -> None:
 
 @cache
 def benchmark_source() -> str:
-    return "\n".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "benchmarks").glob("*.py")))
+    return "\n".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "benchmarks").rglob("*.py")))
 
 
 def benchmark_problems(words: list[str]) -> Iterator[str]:
     """`python -m benchmarks.NAME` must exist, and its options must stand in the benchmarks' code."""
     name = words[words.index("-m") + 1]
-    if not (ROOT / f"{name.replace('.', '/')}.py").is_file():
+    path = ROOT / name.replace(".", "/")
+    if not (path.with_suffix(".py").is_file() or (path / "__main__.py").is_file()):
         yield f"there is no module {name}"
     for word in words:
         if re.fullmatch(r"--[a-z][a-z-]+", word) and f'"{word}"' not in benchmark_source():

@@ -2,7 +2,7 @@
 
 A recovery may end after any pass; the passes before it do not depend on where it ends. Plan, progress and time limits
 share the seconds. They are of two quiet cores of an EPYC, from CPU seconds of the castle's photographs and from
-`benchmarks/texel_speed.py`.
+`benchmarks/fit_speed/texels.py`.
 """
 
 from collections.abc import Sequence

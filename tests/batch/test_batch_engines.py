@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.faults_jobs import BATCH
+from benchmarks.faults.jobs import BATCH
 from mistyle.batch import engines
 from mistyle.batch.farm import ShardNeeds, export
 from mistyle.batch.pipeline import Choices, planned, run_batch

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import captures_cycles
-from benchmarks.material_metrics import best_constant
+from benchmarks.captures import cycles as captures_cycles
+from benchmarks.material_recovery.metrics import best_constant
 from mistyle.core.maps import Maps
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_metrics import noise, plane_view
 
-from benchmarks import consistency_metrics as consistency
+from benchmarks.consistency import metrics as consistency
 from mistyle.core.image import gaussian
 from mistyle.measure import metrics
 from mistyle.measure.overlap import overlap

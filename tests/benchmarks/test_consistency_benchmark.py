@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from test_metrics import noise, plane_view
 
-from benchmarks import consistency_judge, consistency_peer, consistency_scene
+from benchmarks.consistency import judge as consistency_judge
+from benchmarks.consistency import peer as consistency_peer
+from benchmarks.consistency import scene as consistency_scene
 from mistyle.core.asset import Picture
 from mistyle.stylization.settings import Settings
 from mistyle.stylization.surface.exemplar import exemplar as styles

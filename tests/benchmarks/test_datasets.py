@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.datasets import read_stanford_orb, read_tensoir
+from benchmarks.material_recovery.dataset_readers import read_stanford_orb, read_tensoir
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera, orbit, pixel_centres, px_from_world
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused

@@ -6,8 +6,8 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from benchmarks import gallery
-from benchmarks.gallery_draw import Drawn
+from benchmarks.gallery import __main__ as gallery
+from benchmarks.gallery.draw import Drawn
 from mistyle.core.errors import UsageError
 
 SIZE = 64

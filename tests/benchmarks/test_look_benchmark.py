@@ -7,9 +7,15 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks import look, look_light, look_paint, look_peer, look_score, look_sheets, look_styles
-from benchmarks.look_paint import Piece, Tree
-from benchmarks.pipeline_against import Took, compared, of_reports, placed
+from benchmarks.look import __main__ as look
+from benchmarks.look import light as look_light
+from benchmarks.look import paint as look_paint
+from benchmarks.look import peer as look_peer
+from benchmarks.look import score as look_score
+from benchmarks.look import sheets as look_sheets
+from benchmarks.look import styles as look_styles
+from benchmarks.look.paint import Piece, Tree
+from benchmarks.pipeline.against import Took, compared, of_reports, placed
 from mistyle.measure.baked_light import BakedLight
 
 

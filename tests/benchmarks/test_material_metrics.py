@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import material_metrics as mm
+from benchmarks.material_recovery import metrics as mm
 from mistyle.atlas.texels import rasterise
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh

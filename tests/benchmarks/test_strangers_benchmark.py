@@ -1,11 +1,11 @@
-"""The judge of strangers' files (benchmarks/strangers.py) tells right from wrong."""
+"""The judge of strangers' files (benchmarks/strangers) tells right from wrong."""
 
 import json
 
 import pytest
 from PIL import Image
 
-from benchmarks.strangers import expected_cases, main
+from benchmarks.strangers.__main__ import expected_cases, main
 from mistyle.core.errors import UsageError
 
 QUAD = """mtllib m.mtl

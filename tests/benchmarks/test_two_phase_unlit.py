@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks import two_phase_unlit as unlit
+from benchmarks.two_phase_unlit import __main__ as unlit
 
 
 def files(folder, answers):

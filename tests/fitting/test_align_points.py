@@ -9,7 +9,7 @@ import pytest
 from helpers import ROOT, point_cloud
 from scipy.spatial.transform import Rotation
 
-from benchmarks import recovery_pictures as drawing
+from benchmarks.material_recovery import pictures as drawing
 from mistyle.core.mesh import spread_points
 from mistyle.fitting.pipeline.job import MaterialJob
 from mistyle.fitting.pipeline.material import place, references_of

@@ -12,8 +12,8 @@ from test_material import KEYS, SIDE, SIZE, bowl, orbit, photographed
 from test_passes import hashes
 
 import mistyle
-from benchmarks.captures_phone import Drawn, gains, photograph
-from benchmarks.recovery_pictures import Shot
+from benchmarks.captures.phone import Drawn, gains, photograph
+from benchmarks.material_recovery.pictures import Shot
 from mistyle.cli.main import main
 from mistyle.core.light import Lights
 from mistyle.fitting.pipeline.job import MaterialJob

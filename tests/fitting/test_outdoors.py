@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import ROOT
 
-from benchmarks import recovery_pictures as drawing
+from benchmarks.material_recovery import pictures as drawing
 from mistyle.cli.fit import known_albedo
 from mistyle.core.capture import in_memory
 from mistyle.core.errors import InputRefused, UsageError

@@ -10,8 +10,8 @@ import pytest
 from helpers import data
 
 from benchmarks import data as fetching
-from benchmarks.recovery_pictures import fibonacci, one_at_a_time, together
-from benchmarks.recovery_truth import average, fitted_size, footprint, seen, truth
+from benchmarks.material_recovery.pictures import fibonacci, one_at_a_time, together
+from benchmarks.material_recovery.truth import average, fitted_size, footprint, seen, truth
 from mistyle.core.maps import flat_maps
 
 

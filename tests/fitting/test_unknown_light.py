@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import ROOT
 
-from benchmarks import recovery_pictures as drawing
+from benchmarks.material_recovery import pictures as drawing
 from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Material
 from mistyle.core.capture import Captures, in_memory

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import consistency_metrics as consistency
+from benchmarks.consistency import metrics as consistency
 from mistyle.core.camera import orbit, pixel_centres
 from mistyle.core.image import gaussian
 from mistyle.core.view import View

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_metrics import plane_view
 
-from benchmarks import consistency_metrics as consistency
+from benchmarks.consistency import metrics as consistency
 from mistyle.core.camera import px_from_world, world_from_px
 from mistyle.measure.overlap import _axes, overlap, pixel_steps, seen_here, seen_there
 

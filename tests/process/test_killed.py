@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import faults_jobs as jobs
-from benchmarks.faults_kills import Moment
+from benchmarks.faults import jobs
+from benchmarks.faults.kills import Moment
 from mistyle.batch import engines, shard
 from mistyle.batch.pipeline import Choices, describe, planned, summarise
 from mistyle.core.paths import scenes

@@ -7,7 +7,7 @@ import pytest
 from test_recover import DIRECT, LIGHTS, SIZE, directional, fibonacci, photographs, strong_maps
 from test_seam import sphere
 
-from benchmarks.material_metrics import calibration
+from benchmarks.material_recovery.metrics import calibration
 from mistyle.atlas.neighbours import of_islands
 from mistyle.atlas.texels import rasterise
 from mistyle.core.capture import in_memory

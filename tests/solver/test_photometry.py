@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import ROOT
 
-from benchmarks import recovery_pictures as drawing
+from benchmarks.material_recovery import pictures as drawing
 from mistyle.core.camera import pixel_centres
 from mistyle.core.capture import Captures, in_memory
 from mistyle.core.errors import InputRefused

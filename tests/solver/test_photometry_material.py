@@ -7,7 +7,7 @@ import pytest
 from test_photometry import FALL, gains
 from test_seam import sphere
 
-from benchmarks import recovery_pictures as drawing
+from benchmarks.material_recovery import pictures as drawing
 from mistyle.core.camera import pixel_centres
 from mistyle.core.capture import in_memory
 from mistyle.core.image import gaussian

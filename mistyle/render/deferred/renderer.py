@@ -9,9 +9,9 @@ summed over delta lights exactly. Materials are rows of one table of texels (`ma
 
 Gradients by the table are gathers: each sample's eight derivatives are written in one packet, then each texel sums
 those of the samples that read it, in a fixed order. Bytes are equal in any run and at any number of threads. Of the
-methods in `benchmarks/fit_speed.py` this is the fastest that gives the same picture: 1.3 ms. Packed atomic adds take
-11 ms (14 in texel order, where neighbours collide), and SciPy's sparse product 2.0 ms plus a sync. Shading texels
-instead of pixels would give a different picture.
+methods in `benchmarks/fit_speed` this is the fastest that gives the same picture: 1.3 ms. Packed atomic adds take 11 ms
+(14 in texel order, where neighbours collide), and SciPy's sparse product 2.0 ms plus a sync. Shading texels instead of
+pixels would give a different picture.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from benchmarks.faults_corpus import dng
+from benchmarks.faults.corpus import dng
 from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
 from mistyle.io.cameras.camera_files import transforms

@@ -1,5 +1,5 @@
 """Damaged and hostile files of every format: each is read, or refused with one sentence. What must hold is told in
-benchmarks/faults_inputs.py; `python -m benchmarks.faults_inputs` tries thousands."""
+benchmarks/faults/inputs.py; `python -m benchmarks.faults.inputs` tries thousands."""
 
 import random
 from pathlib import Path
@@ -8,9 +8,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.faults_corpus import Seed, png, seeds
-from benchmarks.faults_damage import damaged
-from benchmarks.faults_inputs import GIGABYTES, commands, listing, outcome, peak_reader_gb
+from benchmarks.faults.corpus import Seed, png, seeds
+from benchmarks.faults.damage import damaged
+from benchmarks.faults.inputs import GIGABYTES, commands, listing, outcome, peak_reader_gb
 
 SEEDS = seeds()
 

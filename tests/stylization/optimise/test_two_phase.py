@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from test_seam import sphere
 
-from benchmarks import two_phase_struggle as struggle
-from benchmarks import two_phase_truth as known
-from benchmarks.material_metrics import map_errors, texel_areas
-from benchmarks.two_phase import light_left
+from benchmarks.material_recovery.metrics import map_errors, texel_areas
+from benchmarks.two_phase import struggle
+from benchmarks.two_phase import truth as known
+from benchmarks.two_phase.__main__ import light_left
 from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset, Picture, Source
 from mistyle.core.light import Directional, lights

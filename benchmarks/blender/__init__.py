@@ -1,0 +1,1 @@
+"""Our assets opened in Blender's Cycles."""

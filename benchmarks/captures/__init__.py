@@ -1,0 +1,1 @@
+"""Photographs as they come: exposures, unknown skies, clutter, metals, plans."""

@@ -1,0 +1,1 @@
+"""Views of one surface that agree, beside EbSynth."""

@@ -1,0 +1,1 @@
+"""Damaged inputs, killed jobs, full disks, strangers' folders."""

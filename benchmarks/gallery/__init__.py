@@ -1,0 +1,1 @@
+"""Public glTF and USD models, drawn here and in Cycles."""

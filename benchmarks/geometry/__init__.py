@@ -1,0 +1,1 @@
+"""Vertices displaced to drawn outlines."""

@@ -1,0 +1,1 @@
+"""How the embedded stylizer looks: light in the albedo, and the choices of blind viewers."""

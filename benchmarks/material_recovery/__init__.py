@@ -1,0 +1,1 @@
+"""Materials fitted to pictures with known truth, beside rivals. Other benchmarks use its pictures and metrics."""

@@ -1,0 +1,1 @@
+"""Whole jobs, here and at another commit."""

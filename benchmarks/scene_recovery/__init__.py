@@ -1,0 +1,1 @@
+"""Parameters of any Mitsuba scene, fitted to its renders."""

@@ -1,0 +1,1 @@
+"""A folder of odd inputs, judged by what is right for each."""

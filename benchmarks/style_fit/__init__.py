@@ -1,0 +1,1 @@
+"""The two-phase fit's speed, and the ranking of styles without weights."""

@@ -1,0 +1,1 @@
+"""The two-phase fit on painted objects of known relief."""
