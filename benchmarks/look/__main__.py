@@ -134,9 +134,7 @@ def sheets(chosen: argparse.Namespace) -> dict[str, float]:
     if "finish" in tests and not chosen.vgg:
         raise SystemExit("sheets of finish need the weights of VGG-19: --vgg FILE (`mistyle models` says where from)")
     if "ebsynth" in tests and not chosen.ebsynth:
-        raise SystemExit(
-            "sheets of ebsynth need its program: --ebsynth PROGRAM (peer.py says where it comes from)"
-        )
+        raise SystemExit("sheets of ebsynth need its program: --ebsynth PROGRAM (peer.py says where it comes from)")
     found = pieces(chosen, chosen_presets(chosen, "draft,standard"))
     start_engines()
     ours = look_paint.this_tree()

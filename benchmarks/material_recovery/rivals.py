@@ -71,7 +71,17 @@ def naive(folder: Path, truth: Truth, seconds: float, name: str) -> NaiveFit:
     options = LOOPS[name]
     seconds *= CONVERGED if "--converge" in options else 1
     out = folder / "maps.npz"
-    command = [sys.executable, str(NAIVE), str(folder), "--seconds", f"{seconds:.2f}", "--out", str(out), *options]
+    command = [
+        sys.executable,
+        "-P",
+        str(NAIVE),
+        str(folder),
+        "--seconds",
+        f"{seconds:.2f}",
+        "--out",
+        str(out),
+        *options,
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)} ended with {done.returncode}:\n{done.stderr[-3000:]}")
