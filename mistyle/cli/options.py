@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import json
 import re
 import sys
 import textwrap
@@ -23,16 +24,21 @@ NUMBER = re.compile(r"-\.?\d")  # begins a negative number, also one in a list o
 
 class VerbParser(argparse.ArgumentParser):
     """A parser, and that of its verbs, whose options take values that begin with a dash. A wrong command line ends with
-    a sentence instead of the usage, which is long."""
+    a sentence instead of the usage, which is long; with --json also with an object, as every other error does."""
+
+    wants_json = False  # whether the words hold --json
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         words = with_values(self, sys.argv[1:] if args is None else args)
+        self.wants_json = "--json" in words
         found, unknown = super().parse_known_args(words, namespace)
         if unknown and self._subparsers is None:
             self.error(_about_unknown(self, unknown))
         return found, unknown
 
     def error(self, message: str) -> NoReturn:
+        if self.wants_json:
+            print(json.dumps({"error": message, "exit_code": 2}))
         self.exit(2, f"{self.prog}: {message} (`{self.prog} --help` lists all)\n")
 
 

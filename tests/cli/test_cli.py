@@ -148,6 +148,21 @@ def test_unknown_options_name_the_nearest(name, verb, capsys):
 
 
 @pytest.mark.parametrize(("name", "verb"), list(verbs(parser())))
+def test_a_wrong_command_line_is_an_object_where_json_is_asked_for(name, verb, capsys):
+    if verb._subparsers is not None:
+        return
+    for words in (["--zzzzzz"], ["--json", "--zzzzzz"]):
+        with pytest.raises(SystemExit):
+            verb.parse_known_args(words)
+        answer = capsys.readouterr()
+        if "--json" in words:
+            found = json.loads(answer.out)
+            assert found["exit_code"] == 2 and answer.err.startswith(f"mistyle {name}: {found['error']}")
+        else:
+            assert answer.out == ""
+
+
+@pytest.mark.parametrize(("name", "verb"), list(verbs(parser())))
 def test_values_may_begin_with_a_dash(name, verb, monkeypatch):
     """Numbers and choices after every option of every verb; argparse alone expects an argument."""
     for action in verb._actions:
