@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS)
 from browser import NO_BROWSER
 from helpers import NO_DATA
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 from mistyle.setup import environment
 
@@ -24,6 +26,10 @@ environment.use_llvm()
 # Tests import torch before a job tells OpenMP how to wait (mistyle/process/cores.py): threads that spin on two busy
 # cores made a small network's operations eight times slower.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# Workers of the tests share the cores, on which threads of a BLAS wait for one another (mistyle/process/cores.py). The
+# variable is for processes that tests start.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+threadpool_limits(limits=1, user_api="blas")
 # Compiled modules are kept: each of the many processes that tests start would compile the package anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

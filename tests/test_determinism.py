@@ -69,7 +69,7 @@ def twice(tmp_path_factory) -> tuple[Path, Path]:
     """The folders of two runs, side by side."""
     place = tmp_path_factory.mktemp("twice")
     outs = place / "first", place / "second"
-    other = {"PYTHONHASHSEED": "4711", MALLOC_FILL: "85", "OPENBLAS_NUM_THREADS": "1"}
+    other = {"PYTHONHASHSEED": "4711", MALLOC_FILL: "85", "OPENBLAS_NUM_THREADS": "3"}
     running = [
         start(place / "here", outs[0], PYTHONHASHSEED="0"),
         start(place / "else where", outs[1], "1", **other),

@@ -14,10 +14,11 @@ def cores() -> int:
 
 
 def use_threads(count: int) -> None:
-    """Set the thread count of torch, OpenCV and the BLAS of NumPy and SciPy in this process to `count`.
+    """Set the thread count of torch and OpenCV in this process to `count`, that of NumPy's and SciPy's BLAS to 1.
 
-    The last digits of a matrix product depend on the count. By default a BLAS takes all cores, however many shards
-    share them. Dr.Jit has its own count: `render/mitsuba/device.use`.
+    Matrices are small here, and the threads of a BLAS wait for one another: where others use the cores too, they take
+    up to hundreds of times as long as one. The last digits of a matrix product depend on the count as well. Dr.Jit has
+    its own count: `render/mitsuba/device.use`.
     """
     # torch spins for milliseconds after each operation, on cores that Dr.Jit's threads and other jobs need: most of a
     # fit's processor time. OpenMP reads this variable when it is loaded; a user's value stays.
@@ -31,7 +32,7 @@ def use_threads(count: int) -> None:
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(count)
     cv2.setNumThreads(count)
-    threadpool_limits(limits=count, user_api="blas")
+    threadpool_limits(limits=1, user_api="blas")
 
 
 def in_pieces(place: memoryview, fill: Callable[[int, memoryview], None], threads: int) -> None:
