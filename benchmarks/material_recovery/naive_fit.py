@@ -41,8 +41,9 @@ RATE = {False: 0.01, True: 0.003}
 # A light from one direction is only met by asking for it.
 DIRECT = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
 PRB = {"type": "prb", "max_depth": 3}
-# Converged: over SWEEPS sweeps through the pictures the mean loss is above SETTLED times that of as many before.
+# Settled: over SWEEPS sweeps through the pictures the mean loss is above SETTLED times that of as many before.
 SWEEPS, SETTLED = 8, 0.995
+HALVINGS = 5  # of the rate, one each time the loss has settled; at a constant rate the noise of one sample remains
 
 
 def texture(values):
@@ -116,7 +117,7 @@ def admissible(name, values):
     return dr.clip(values, ROUGHNESS_FLOOR if name == "roughness" else 0, 1)
 
 
-def converged(losses, pictures):
+def settled(losses, pictures):
     """Whether the losses of single steps (one picture each) have settled."""
     size = SWEEPS * pictures
     if len(losses) < 2 * size or len(losses) % pictures:
@@ -126,7 +127,7 @@ def converged(losses, pictures):
 
 def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, seed=0, progress=None, converge=False):
     """Optimise for `seconds` (loading and one step that compiles the kernels are not counted), with `converge` until
-    the loss has settled, if that is earlier; returns the arrays."""
+    the loss has settled at the smallest rate, if that is earlier; returns the arrays."""
     rate = rate or RATE[pyramid]
     folder = Path(folder)
     job = json.loads((folder / "job.json").read_text())
@@ -159,8 +160,8 @@ def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, s
                 params[key] = optimiser[key]
 
     rng = np.random.default_rng(seed)
-    order, step, start, losses = [], 0, time.perf_counter(), []
-    while step < 1 or time.perf_counter() - start < seconds:
+    order, step, start, losses, halved = [], 0, time.perf_counter(), [], 0
+    while halved <= HALVINGS and (step < 1 or time.perf_counter() - start < seconds):
         order = order or rng.permutation(len(references)).tolist()
         k = order.pop()
         textures()
@@ -177,8 +178,9 @@ def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, s
         step += 1
         if converge:
             losses.append(float(loss.array[0]))
-            if converged(losses, len(references)):
-                break
+            if settled(losses, len(references)):
+                halved, losses = halved + 1, []
+                optimiser.set_learning_rate(rate / 2**halved)
         if progress:
             progress(min(1.0, (time.perf_counter() - start) / seconds))
     dr.eval(*(optimiser[key] for key in optimiser.keys()))
@@ -186,7 +188,7 @@ def fit(folder, seconds, pyramid=False, rate=None, samples=1, integrator=None, s
     took = time.perf_counter() - start
     with dr.suspend_grad():
         textures()
-    result = {"steps": step - 1, "seconds": took, "converged": converge and converged(losses, len(references))}
+    result = {"steps": step - 1, "seconds": took, "converged": halved > HALVINGS}
     for (k, name), key in names.items():
         values = np.array(params[key])
         if name == "normal":
@@ -205,7 +207,7 @@ def main():
     parser.add_argument("--rate", type=float, help="Adam's learning rate (0.01; pyramid 0.003)")
     parser.add_argument("--samples", type=int, default=1, help="samples a pixel and step")
     parser.add_argument("--integrator", choices=["direct", "prb"], default="direct", help="prb: with interreflection")
-    parser.add_argument("--converge", action="store_true", help="end where the loss falls no more")
+    parser.add_argument("--converge", action="store_true", help="halve the rate where the loss falls no more, and end")
     parser.add_argument("--variant", default="llvm_ad_rgb")
     options = parser.parse_args()
     mi.set_variant(options.variant)
