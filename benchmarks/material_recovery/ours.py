@@ -12,6 +12,7 @@ from benchmarks.material_recovery.truth import Truth
 from mistyle.core.capture import in_memory
 from mistyle.core.maps import Maps
 from mistyle.fitting.light.unknown_light import find_light
+from mistyle.process.cores import cores, use_threads
 from mistyle.render.mitsuba.scene import Frame
 from mistyle.solver.recover import NO_LIMITS, Limits, recover
 from mistyle.solver.settings import RecoverSettings
@@ -48,6 +49,7 @@ def ours(
         cameras, [s.lights for s in shots], [np.ascontiguousarray(p[..., :3]) for p in pictures], masks
     )
     settings = RecoverSettings(**({"metallic": True, "frame": frame} | chosen))
+    use_threads(cores())  # as a job does
     start = time.perf_counter()
     if unknown:
         light = find_light(known.mesh, captures, settings).light
