@@ -18,7 +18,7 @@ try:
     from benchmarks.material_recovery import pictures as drawing
     from benchmarks.material_recovery.ours import ours
     from benchmarks.material_recovery.truth import truth
-except ModuleNotFoundError:
+except ImportError:
     from benchmarks import recovery_pictures as drawing
     from benchmarks.recovery_ours import ours
     from benchmarks.recovery_truth import truth
