@@ -48,12 +48,36 @@ def level_on(positions, normals, grid, count, dj):
     return samples.with_tables(points, tangent, np.ones(len(tangent), np.float32), dj)
 
 
-def test_vibrations_step_where_the_surface_is_narrow(dj):
-    # Two balls that touch in a narrow neck: the lowest vibration has one sign on each.
+def two_balls(dj):
+    """Samples on two balls that touch in a narrow neck, one above the other."""
     turn, height = np.meshgrid(np.arange(48) * 2 * np.pi / 48, np.linspace(-1.95, 1.95, 80))
     radius = np.sqrt(np.maximum(1 - (np.abs(height) - 1) ** 2, 0.01))
     positions = np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], -1).reshape(-1, 3) / 2
-    level = level_on(positions, positions - np.sign(positions[:, 1:2]) * np.array([0, 0.5, 0]), (80, 48), 3000, dj)
+    return level_on(positions, positions - np.sign(positions[:, 1:2]) * np.array([0, 0.5, 0]), (80, 48), 3000, dj)
+
+
+def snake(dj):
+    """Samples on a tube along x with three humps."""
+    turn, along = np.meshgrid(np.arange(24) * 2 * np.pi / 24, np.linspace(-3, 3, 120))
+    out = np.stack([0 * turn, np.cos(turn), np.sin(turn)], -1).reshape(-1, 3)
+    middle = np.stack([along, 0.6 * np.cos(2 * along), 0 * along], -1).reshape(-1, 3)
+    return level_on(middle + 0.3 * out, out, (120, 24), 3000, dj)
+
+
+def test_lightness_follows_height_unless_the_normals_tell_it(dj, ball_levels):
+    for level, follows in ((snake(dj), True), (ball_levels[-1], False)):
+        openness = np.ones(len(level.directed), np.float32)
+        first = places.place_fields(level, openness)[:, 0]
+        lit = places.light(level.points.normals, openness)
+        modes = places.without(places.laplacian_modes(level, places.MODES), lit)
+        mode = modes[:, modes.std(axis=0) >= places.FIRM][:, 0]
+        assert (np.corrcoef(first, level.points.positions[:, 1])[0, 1] > 0.6) == follows
+        assert (abs(np.corrcoef(first, mode)[0, 1]) > 0.999) != follows
+
+
+def test_vibrations_step_where_the_surface_is_narrow(dj):
+    """The lowest vibration has one sign on each ball."""
+    level = two_balls(dj)
     first = places.laplacian_modes(level, 4)[:, 0]
     upper = level.points.positions[:, 1] > 0
     assert np.mean((first > 0) == upper) > 0.98 or np.mean((first > 0) == ~upper) > 0.98

@@ -91,8 +91,8 @@ def mixed(
 def places(levels: Sequence[Level], base: SurfacePoints, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """`place_fields` at the points of `base`, computed on the finest level with at most FIELD_POINTS samples.
 
-    The first, for lightness, increases upwards on average: heads and lids are light, and dark strokes draw their
-    features.
+    The first, for lightness, increases upwards on average: heads and lids are light, legs and feet dark, and dark
+    strokes draw features.
     """
     small = next((level for level in reversed(levels) if len(level.directed) <= FIELD_POINTS), levels[0])
     fields = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)

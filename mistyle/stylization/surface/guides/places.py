@@ -1,9 +1,9 @@
 """Place fields: smooth functions over the surface that follow its parts and assign colours without light.
 
-The lowest Laplacian eigenvectors change where the surface is narrow or creased and are nearly constant on its parts. So
-an ear, a leg or a lid has its own colour. Their components explained by light (surface direction, openness) are
-removed, so that the albedo has no shading. Where the shape is its own mirror image, so are they: both horns of a head
-have one colour.
+Lightness follows height. The axes of chroma follow the lowest Laplacian eigenvectors, which change where the surface is
+narrow or creased and are nearly constant on its parts: an ear, a leg or a lid has its own colour. The components
+explained by light (surface direction, openness) are removed, so that the albedo has no shading. Where the shape is its
+own mirror image, so are the fields: both horns of a head have one colour.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from mistyle.stylization.surface.samples import Level, workers
 
 FIELDS = 3  # one for lightness, two for the axes of chroma
 MODES = 24  # candidate eigenvectors for the fields
-FIRM = 0.45  # least share of an eigenvector that must remain without the light's component
+FIRM = 0.45  # least share of a field that must remain without the light's component
 CONCAVE = 8.0  # decay of two neighbours' weight per radian of a concave crease
 SHIFT = 1e-5  # keeps the factorised matrix regular; far below the first eigenvalue
 NEAR, ALIKE, SHARE = 2.0, 0.7, 0.9  # of a mirror image: spacings to a point, cosine of their normals, share of points
@@ -103,12 +103,17 @@ def place_fields(level: Level, openness: Float[np.ndarray, " n"]) -> Float[np.nd
     """Three smooth fields over the surface (mean 0, standard deviation 1), linearly independent of light.
 
     They are the lowest eigenvectors with a share of at least FIRM after removal of the light's component. If too few
-    qualify, the others follow by remaining share.
+    qualify, the others follow by remaining share. Height replaces the first if its share is as large: it is not where
+    a shape is convex all over, as its normals then tell how high a point lies.
     """
-    modes = laplacian_modes(level, MODES)
-    rest = without(modes, light(level.points.normals, openness))
+    explained = light(level.points.normals, openness)
+    rest = without(laplacian_modes(level, MODES), explained)
     left = rest.std(axis=0)
     order = np.concatenate([np.flatnonzero(left >= FIRM), np.argsort(-left, kind="stable")])
     chosen = list(dict.fromkeys(order.tolist()))[:FIELDS]
     fields = rest[:, chosen + chosen[-1:] * (FIELDS - len(chosen))]
+    height = level.points.positions[:, 1:2].astype(np.float64)
+    free = without((height - height.mean()) / max(float(height.std()), 1e-12), explained)
+    if free.std() >= FIRM:
+        fields[:, :1] = free
     return (fields / np.maximum(fields.std(axis=0), 1e-12)).astype(np.float32)
