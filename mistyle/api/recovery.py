@@ -13,6 +13,7 @@ from mistyle.core.capture import Captures, shrunk
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
+from mistyle.process.cores import single_blas
 from mistyle.solver.settings import RecoverSettings
 
 SURE = 0.5  # confidence above which a texel counts as determined
@@ -96,15 +97,9 @@ def recover(
                            '(..., lights="unknown") estimates an unknown light.')  # fmt: skip
     texels = tuple(rasterise(shape, part, size) for part in range(len(shape.parts)))
     by = downsampling_factors(texels, captures.cameras)
-    done = solve(
-        shape,
-        texels,
-        shrunk(captures, by),
-        chosen,
-        seed,
-        progress or (lambda share: None),
-        start=[start] if isinstance(start, Maps) else start,
-    )
+    first = [start] if isinstance(start, Maps) else start
+    with single_blas():
+        done = solve(shape, texels, shrunk(captures, by), chosen, seed, progress or (lambda share: None), start=first)
     return MaterialFit(
         maps=done.maps,
         confidence=done.confidence,

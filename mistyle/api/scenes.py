@@ -7,6 +7,7 @@ from os import PathLike
 from typing import Any
 
 from mistyle.api import html
+from mistyle.process.cores import single_blas
 from mistyle.solver.scene.result import FittedScene
 
 
@@ -103,29 +104,30 @@ def fit_scene(
             if k < len(valid):
                 valid[k] = usable if valid[k] is None else valid[k] & usable
         pictures.append(picture)
-    fitted = run(
-        scene,
-        [keys] if isinstance(keys, str) else keys,
-        sensors,
-        pictures,
-        loss=loss,
-        regularizers=regularizers,
-        callback=callback,
-        iterations=iterations,
-        spp=spp,
-        spp_grad=spp_grad,
-        rate=rate,
-        pyramid=pyramid,
-        sensors_per_step=sensors_per_step,
-        seed=seed,
-        solver=solver,
-        integrator=integrator,
-        fast=fast,
-        masks=valid,
-        only=only,
-        save=save,
-        save_every=save_every,
-        resume=resume,
-        progress=progress or (lambda done: None),
-    )
+    with single_blas():
+        fitted = run(
+            scene,
+            [keys] if isinstance(keys, str) else keys,
+            sensors,
+            pictures,
+            loss=loss,
+            regularizers=regularizers,
+            callback=callback,
+            iterations=iterations,
+            spp=spp,
+            spp_grad=spp_grad,
+            rate=rate,
+            pyramid=pyramid,
+            sensors_per_step=sensors_per_step,
+            seed=seed,
+            solver=solver,
+            integrator=integrator,
+            fast=fast,
+            masks=valid,
+            only=only,
+            save=save,
+            save_every=save_every,
+            resume=resume,
+            progress=progress or (lambda done: None),
+        )
     return replace(SceneFit(**vars(fitted)), notes=(*notes, *fitted.notes, *merged(fitted.parameters)))

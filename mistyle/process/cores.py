@@ -4,6 +4,8 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from typing import Any
 
 PIECE = 1 << 23
 
@@ -26,13 +28,19 @@ def use_threads(count: int) -> None:
     # OpenMP also reads its thread count at load time. Importing torch only to set it would take seconds.
     os.environ["OMP_NUM_THREADS"] = str(count)
     import cv2
-    import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, whose count cannot be set later)
-    from threadpoolctl import threadpool_limits
 
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(count)
     cv2.setNumThreads(count)
-    threadpool_limits(limits=1, user_api="blas")
+    single_blas()
+
+
+def single_blas() -> AbstractContextManager[Any]:
+    """Set the thread count of NumPy's and SciPy's BLAS to 1: see `use_threads`. A `with` block restores it."""
+    import scipy.linalg  # noqa: F401  (SciPy's own BLAS; loaded later it would keep all threads)
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(limits=1, user_api="blas")
 
 
 def in_pieces(place: memoryview, fill: Callable[[int, memoryview], None], threads: int) -> None:

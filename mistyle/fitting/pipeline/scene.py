@@ -23,8 +23,8 @@ from mistyle.io.store.output import claim, keep_folder
 from mistyle.jobs import checkpoint
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.run_record import write_record
-from mistyle.jobs.settings import thread_count
 from mistyle.jobs.stages import program
+from mistyle.jobs.start import start_engines
 from mistyle.jobs.versions import peak_gb, versions
 from mistyle.process import stopping
 
@@ -53,11 +53,10 @@ class SceneJob:
 def loaded(scene: Path, defines: Mapping[str, str], settings: SceneSettings) -> Any:
     """The scene file, ready for a fit (`SceneFile`)."""
     from mistyle.render.live.xml import load_scene_for_fit
-    from mistyle.render.mitsuba import device
 
     if not scene.is_file():
         raise InputRefused(f"{scene}: found nothing, expected a Mitsuba scene file; check the path")
-    device.use(None if settings.variant == "auto" else settings.variant, thread_count(settings))
+    start_engines(settings)
     return load_scene_for_fit(scene, defines)
 
 

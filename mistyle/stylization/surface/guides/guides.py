@@ -97,8 +97,7 @@ def places(levels: Sequence[Level], base: SurfacePoints, openness: Float[np.ndar
     small = next((level for level in reversed(levels) if len(level.directed) <= FIELD_POINTS), levels[0])
     fields = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)
     rest = without(fields, light(base.normals, openness))
-    if (rest[:, 0] * base.positions[:, 1]).sum() < 0:
-        rest[:, 0] = -rest[:, 0]
+    rest[:, 0] *= -1 if rest[:, 0] @ base.positions[:, 1] < 0 else 1
     return (rest / np.maximum(rest.std(axis=0), 1e-9)).astype(np.float32)
 
 
@@ -169,9 +168,7 @@ def normal_scores(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Values replaced by the standard normal quantiles of their ranks."""
     from scipy.special import ndtri
 
-    rank = np.empty(len(values))
-    rank[np.argsort(values, kind="stable")] = (np.arange(len(values)) + 0.5) / len(values)
-    return ndtri(rank)
+    return at_quantiles(values, ndtri((np.arange(len(values)) + 0.5) / len(values)))
 
 
 def at_quantiles(values: Float[np.ndarray, " n"], of: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:

@@ -1,9 +1,8 @@
 """Place fields: smooth functions over the surface that follow its parts and assign colours without light.
 
-Lightness follows height. The axes of chroma follow the lowest Laplacian eigenvectors, which change where the surface is
-narrow or creased and are nearly constant on its parts: an ear, a leg or a lid has its own colour. The components
-explained by light (surface direction, openness) are removed, so that the albedo has no shading. Where the shape is its
-own mirror image, so are the fields: both horns of a head have one colour.
+Lightness follows height, chroma the lowest Laplacian eigenvectors, which change where the surface is narrow or creased
+and are nearly constant on its parts: a leg or a lid has its own colour. Their components explained by light (surface
+direction, openness) are removed. Symmetric shapes have symmetric fields: both horns of a head have one colour.
 """
 
 import numpy as np
@@ -103,8 +102,7 @@ def place_fields(level: Level, openness: Float[np.ndarray, " n"]) -> Float[np.nd
     """Three smooth fields over the surface (mean 0, standard deviation 1), linearly independent of light.
 
     They are the lowest eigenvectors with a share of at least FIRM after removal of the light's component. If too few
-    qualify, the others follow by remaining share. Height replaces the first if its share is as large: it is not where
-    a shape is convex all over, as its normals then tell how high a point lies.
+    qualify, the others follow by remaining share. Height replaces the first unless light explains it (on a ball).
     """
     explained = light(level.points.normals, openness)
     rest = without(laplacian_modes(level, MODES), explained)
@@ -113,7 +111,7 @@ def place_fields(level: Level, openness: Float[np.ndarray, " n"]) -> Float[np.nd
     chosen = list(dict.fromkeys(order.tolist()))[:FIELDS]
     fields = rest[:, chosen + chosen[-1:] * (FIELDS - len(chosen))]
     height = level.points.positions[:, 1:2].astype(np.float64)
-    free = without((height - height.mean()) / max(float(height.std()), 1e-12), explained)
-    if free.std() >= FIRM:
+    free = without(height, explained)
+    if free.std() > max(FIRM * height.std(), 1e-6):
         fields[:, :1] = free
     return (fields / np.maximum(fields.std(axis=0), 1e-12)).astype(np.float32)
