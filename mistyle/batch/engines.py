@@ -262,7 +262,7 @@ def ray(
     except ImportError:
         raise EnvironmentMissing("the engine 'ray' needs Ray: pip install 'mistyle[ray]'") from None
     if address is None:
-        library.init(_node_ip_address=LOOPBACK, include_dashboard=False, log_to_driver=False, num_cpus=os.cpu_count())
+        _start_cluster(library)
         if (listening := library.util.get_node_ip_address()) != LOOPBACK:
             library.shutdown()
             raise MistyleError(
@@ -275,6 +275,19 @@ def ray(
         return _on_ray(library, plan, todo, cluster, watch, timeout)
     finally:
         library.shutdown()
+
+
+def _start_cluster(library: Any) -> None:
+    """Start Ray's own cluster on this machine. MistyleError, with Ray's reason, where it does not start."""
+    try:
+        library.init(_node_ip_address=LOOPBACK, include_dashboard=False, log_to_driver=False, num_cpus=os.cpu_count())
+    except Exception as error:  # Ray raises plain exceptions
+        library.shutdown()
+        raise MistyleError(
+            f"Ray's cluster did not start on this machine: {' '.join(str(error).split())} Its logs are in "
+            "/tmp/ray/session_latest/logs. Ray needs shared memory, a /dev/shm that it may write to; --engine local "
+            "needs no cluster"
+        ) from error
 
 
 def _on_ray(

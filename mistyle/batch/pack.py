@@ -19,6 +19,7 @@ from pathlib import Path
 
 from mistyle import __version__
 from mistyle.core.errors import EnvironmentMissing, MistyleError
+from mistyle.core.paths import real_path
 from mistyle.io.store.atomic import sha256_file
 from mistyle.io.store.output import claim, replace_files
 from mistyle.jobs.progress import Progress
@@ -75,7 +76,7 @@ def llvm_files() -> tuple[Path, list[Path]]:
         raise EnvironmentMissing("a pack includes the libLLVM in use, and none was found; see mistyle doctor")
     folders = [Path(f) for f in record.get("folders", ())]
     beside = [p for f in folders for p in sorted(f.glob("*.so*")) if not p.is_symlink()]
-    return Path(library).resolve(), [p for p in beside if p.resolve() != Path(library).resolve()]
+    return real_path(Path(library)), [p for p in beside if real_path(p) != real_path(Path(library))]
 
 
 def scripts(extras: Sequence[str], library: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from mistyle.cli.options import add_overwrite_option, examples, given_defines
 from mistyle.core.errors import UsageError
+from mistyle.core.paths import real_path
 
 
 def add_compare(verbs: Any) -> None:
@@ -324,7 +325,7 @@ def _limits_file(options: argparse.Namespace, reference: Path) -> Path | None:
 def safe(out: Path, inputs: list[Path]) -> None:
     """UsageError where OUT contains an input: the next comparison would read this one's pictures as inputs."""
     for path in inputs:
-        if path.resolve().is_relative_to(out.resolve()):
+        if real_path(path).is_relative_to(real_path(out)):
             raise UsageError(f"-o {out}: holds the input {path}; choose another folder")
 
 

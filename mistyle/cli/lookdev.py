@@ -9,6 +9,7 @@ from typing import Any
 
 from mistyle.cli.options import add_overwrite_option, examples
 from mistyle.core.errors import InputRefused
+from mistyle.core.paths import real_path
 
 
 def add_view(verbs: Any) -> None:
@@ -87,7 +88,7 @@ def report_of(place: Path) -> Path:
     candidates = [place] if place.suffix == ".html" else [place / "report" / "index.html", place / "index.html"]
     for path in candidates:
         if path.is_file():
-            return path.resolve()
+            return real_path(path)
     raise InputRefused(
         f"{place}: found no report; expected a finished run folder with report/index.html. "
         "`mistyle stylize` and `mistyle fit` write one; rerun an unfinished job to resume it"

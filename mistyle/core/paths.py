@@ -1,5 +1,7 @@
-"""Paths of mistyle's own files."""
+"""Paths: of mistyle's own files, and of files behind links."""
 
+import errno
+import os
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -9,3 +11,18 @@ def scenes() -> Path:
     """The folder `scenes/`: beside the package in a clone, inside it (`_scenes`) in an installed wheel."""
     beside = PACKAGE.parent / "scenes"
     return beside if beside.is_dir() else PACKAGE / "_scenes"
+
+
+def real_path(path: Path) -> Path:
+    """The absolute path without links; it need not exist.
+
+    Raises OSError (ELOOP) where links lead to themselves, which `Path.resolve` tells differently in every Python: up to
+    3.12 by a RuntimeError, later not at all.
+    """
+    real = os.path.realpath(path)
+    try:
+        os.stat(real)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise
+    return Path(real)

@@ -19,6 +19,7 @@ from mistyle.core.names import (
     split_tile,
     uses,
 )
+from mistyle.core.paths import real_path
 from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.images.ocio import ColourSpace, exr_tags
 from mistyle.io.images.packing import FILM_HEIGHT, HEIGHT, TARGETS, Target, TextureSet, write_slot
@@ -235,6 +236,6 @@ def _look_layer(
     fields = fields_for(finished.manifest, chosen.target)
     variant = identifier(fields["style"]) + (f"_v{chosen.version:03}" if chosen.version is not None else "")
     before = (out / layer).read_text(encoding="utf-8") if (out / layer).is_file() else None
-    asset = replace(asset, source=replace(asset.source, path=source.resolve()))
-    write_look(folder / layer, before, asset, looks, variant, beside=out.resolve())
+    asset = replace(asset, source=replace(asset.source, path=real_path(source)))
+    write_look(folder / layer, before, asset, looks, variant, beside=real_path(out))
     return [layer]

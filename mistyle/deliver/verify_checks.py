@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.errors import InputRefused, MistyleError
+from mistyle.core.paths import real_path
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
 from mistyle.render.external.blender import BLENDER, OPEN_WORKER, blender_command
@@ -85,7 +86,7 @@ def validator_home() -> Path | str:
         done = subprocess.run([npm, "root", "-g"], capture_output=True, text=True, timeout=60)
         places += [Path(done.stdout.strip())] if done.returncode == 0 and done.stdout.strip() else []
     modules = next((p for p in places if (p / "gltf-validator").is_dir()), None)
-    return modules.resolve() if modules else "node found, gltf-validator not found (npm install -g gltf-validator)"
+    return real_path(modules) if modules else "node found, gltf-validator not found (npm install -g gltf-validator)"
 
 
 def gltf(path: Path, name: str) -> Iterator[Check]:
@@ -94,7 +95,7 @@ def gltf(path: Path, name: str) -> Iterator[Check]:
     if isinstance(home, str):
         yield Check(name, "Khronos glTF validator", "not checked", home)
         return
-    command = ["node", "-e", VALIDATE, str(path.resolve())]
+    command = ["node", "-e", VALIDATE, str(real_path(path))]
     done = subprocess.run(
         command, env=os.environ | {"NODE_PATH": str(home)}, capture_output=True, text=True, timeout=300
     )
@@ -225,7 +226,7 @@ def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None)
 
     try:
         with TemporaryDirectory(prefix="mistyle-") as folder:
-            job = {"files": [str(p.resolve()) for p in paths]}
+            job = {"files": [str(real_path(p)) for p in paths]}
             done = run_job(blender_command(blender, OPEN_WORKER), Path(folder) / "job.json", job, "blender")
     except MistyleError as error:
         yield from (Check(name, "Blender", "failed", str(error)[-300:]) for name in names)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.paths import real_path
 from mistyle.io.sandbox.bounds import USD
 
 
@@ -16,7 +17,7 @@ def input_files(path: Path) -> tuple[Path, ...]:
     if path.suffix.lower() in USD:
         from mistyle.io.read_mesh import read_usd_files
 
-        return (path, *sorted(p for p in read_usd_files(path) if p != path.resolve()))
+        return (path, *sorted(p for p in read_usd_files(path) if p != real_path(path)))
     from mistyle.io.read_mesh import read_references
 
     return (path, *read_references(path))

@@ -152,6 +152,8 @@ def unexpected(error: OSError) -> MistyleError | None:
             f"{named}: found nothing; it was removed or renamed while the job ran, or never existed. "
             "Put it back, and run the same command again"
         )
+    if error.errno in (errno.ELOOP, errno.ENAMETOOLONG):
+        return InputRefused(f"{named}: names no file or folder ({os.strerror(error.errno)}); choose another path")
     if error.errno in NOT_TO_BE_WRITTEN:
         return InputRefused(f"{named}: cannot be opened ({error.strerror}); get permission to read it")
     if error.errno in BROKEN:

@@ -93,6 +93,11 @@ def _python_command() -> str:
     return f"install Python {version} from python.org with its pip and venv"
 
 
+def _compiler_command() -> str:
+    commands = {"apt-get": "sudo apt-get install -y g++ python3-dev", "dnf": "sudo dnf install gcc-c++ python3-devel"}
+    return next((command for tool, command in commands.items() if shutil.which(tool)), "with your system's tools")
+
+
 # pip, where Python lacks it (Debian and Ubuntu ship ensurepip in python3-venv)
 
 
@@ -293,12 +298,18 @@ def _sentence(output: str) -> str:
             f"pip cannot reach its package registry ({cause[0]}); check the network, the proxy and `pip config list`, "
             "then rerun to resume"
         )
+    system = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
     # pip prints the second message for a single package that is pinned twice and does not exist.
     if missing := re.search(r"No matching distribution found for (\S+)|Cannot install (\S+) because", output):
-        system = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
         return (
             f"the registry cannot be reached or has no {missing[1] or missing[2]} for {system} (mistyle is tested with "
-            "3.11, 3.12 and 3.13)"
+            "3.11, 3.13 and 3.14)"
+        )
+    if unbuilt := re.findall(r"Failed building wheel for (\S+)|generating package metadata\.?\s+╰─> (\S+)", output):
+        names = ", ".join(dict.fromkeys(wheel or source for wheel, source in unbuilt))
+        return (
+            f"the registry has no binary of {names} for {system}, and it could not be compiled; install a C++ compiler "
+            f"and Python's headers ({_compiler_command()}), or use Python 3.11 to 3.13"
         )
     errors = re.findall(r"^\s*(?:ERROR|error): (.+)$", output, re.MULTILINE)
     return f"pip failed: {errors[-1].strip().rstrip('.') if errors else 'it printed no reason'}"

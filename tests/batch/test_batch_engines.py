@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -118,3 +119,16 @@ def test_ray_that_cannot_serve_says_so_instead_of_waiting(tmp_path):
     plan = plan_in(tmp_path / "out")
     with pytest.raises(MistyleError, match="offers .* GPUs, each shard needs 2"):
         run_batch(plan, Choices(engine="ray", threads=1, gpus=2))
+
+
+def test_a_cluster_that_does_not_start_is_a_sentence():
+    """Ray raises a plain exception, for example where /dev/shm may not be written to."""
+    from mistyle.core.errors import MistyleError
+
+    def init(**_: object) -> None:
+        raise Exception("The node timed out\nduring startup.")
+
+    ended: list[bool] = []
+    with pytest.raises(MistyleError, match="did not start on this machine: The node timed out during startup.*local"):
+        engines._start_cluster(SimpleNamespace(init=init, shutdown=lambda: ended.append(True)))
+    assert ended

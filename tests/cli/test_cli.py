@@ -11,6 +11,7 @@ import pytest
 
 from mistyle.cli.main import USED, main, parser
 from mistyle.cli.options import NUMBER, with_values
+from mistyle.core.paths import scenes
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -83,6 +84,39 @@ def test_trouble_is_one_sentence_and_a_code(arguments, code, sentence, capsys, t
     said = capsys.readouterr().err
     assert sentence in said and "Traceback" not in said
     assert not list(tmp_path.iterdir()), "a refused job leaves nothing behind"
+
+
+@pytest.mark.parametrize("path", ["x" * 300, "loop/file"], ids=["long", "loop"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "stylize {} {} -o OUT",
+        "stylize {robot} {} -o OUT",
+        "stylize {robot} {painting} -o {}",
+        "stylize {robot} {painting} -o OUT --config {}",
+        "render {robot} -o {}",
+        "bake {robot} {} -o OUT",
+        "fit {robot} {} -o OUT",
+        "fit --scene {} --list",
+        "compare {} {painting} -o OUT",
+        "compare {painting} {painting} -o {}",
+        "batch {} -o OUT",
+        "batch {scenes} -o {}",
+        "export {} -o OUT",
+        "verify {}",
+        "view {}",
+        "lookdev {} -o OUT",
+    ],
+)
+def test_a_path_that_the_system_cannot_follow_is_named(line, path, capsys, tmp_path, monkeypatch):
+    """Names that are too long and links to themselves, as every verb's input and output."""
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    monkeypatch.chdir(tmp_path)
+    files = {"robot": scenes() / "robot.obj", "painting": scenes() / "demo_mosaic.jpg", "scenes": scenes()}
+    assert main([word.format(path, **files) for word in line.split()]) in (2, 3)
+    said = capsys.readouterr().err
+    assert path in said and "Traceback" not in said
+    assert [found.name for found in tmp_path.iterdir()] == ["loop"]
 
 
 def test_errors_are_json_where_asked(capsys, tmp_path, monkeypatch):

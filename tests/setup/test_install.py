@@ -150,6 +150,11 @@ def test_pip_is_kept_inside_the_environment(tmp_path, monkeypatch):
         ("WARNING: Retrying after connection broken by 'NewConnectionError(x)'\nERROR: No matching ...", "registry"),
         ("ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device", "disk is full"),
         ("ERROR: No matching distribution found for xatlas==0.0.11", "no xatlas==0.0.11 for Python"),
+        (
+            "  ERROR: Failed building wheel for flip-evaluator\n  ERROR: Failed building wheel for xatlas\nerror: x",
+            "no binary of flip-evaluator, xatlas for Python",
+        ),
+        ("× Encountered error while generating package metadata.\n╰─> scipy==1.17.1\nerror: x", "C++ compiler"),
         ("noise\nERROR: Cannot unpack file x.\n", "pip failed: Cannot unpack file x"),
         ("", "printed no reason"),
     ],

@@ -1,6 +1,7 @@
 """Pictures that are averaged for a coarse level of the per-texel solver, and how coarse that level is."""
 
 import numpy as np
+from helpers import assert_same
 from test_recover import SIZE, errors, world  # noqa: F401  (a fixture)
 
 from mistyle.atlas.texels import rasterise
@@ -34,7 +35,8 @@ def test_averages_are_kept_where_memory_allows(world, monkeypatch):  # noqa: F81
             valid = wanted.load(3)[1]
             np.testing.assert_array_equal(got[valid], expected[valid])
     poor, left = level_pictures.level_captures(texels, captures, 1.0)
-    assert left == 1.0 and poor.cameras == small.cameras
+    assert left == 1.0
+    assert_same(poor.cameras, small.cameras)
 
 
 def test_a_coarse_level_finds_as_much_on_averages(world, monkeypatch):  # noqa: F811

@@ -1,6 +1,7 @@
 """What several test files share."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,3 +46,8 @@ def point_cloud(file: Path, points: np.ndarray) -> None:
     header += "".join(f"property float {axis}\n" for axis in "xyz")
     header += "".join(f"property uint8 {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     file.write_text(header + "".join(f"{x:8f} {y:8f} {z:8f} 1 2 3\n" for x, y, z in points))
+
+
+def assert_same(records: Sequence[Any], others: Sequence[Any]) -> None:
+    """Records of arrays and numbers field by field, a NaN equal to itself; their own == cannot compare arrays."""
+    np.testing.assert_equal([vars(record) for record in records], [vars(other) for other in others])

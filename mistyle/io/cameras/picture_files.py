@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.paths import real_path
 from mistyle.io.cameras.camera_files import ENDINGS, stem
 from mistyle.io.sandbox.bounds import inside, refuse
 
@@ -25,7 +26,7 @@ def picture_folder(pictures: Path) -> Path:
 
 def images_folder(path: Path, model: Path) -> Path:
     """The folder of a COLMAP model's pictures."""
-    places = [p / "images" for p in (path, *path.resolve().parents[:2])]
+    places = [p / "images" for p in (path, *real_path(path).parents[:2])]
     folder = next((place for place in places if place.is_dir()), None)
     if folder is None:
         raise refuse(model, "no folder 'images' beside the model", "the pictures' folder", HAND_IN)
@@ -88,7 +89,7 @@ def check_different(pictures: Mapping[str, Path], folder: Path) -> None:
     """Refuse one picture for two views: names without their folders may coincide."""
     first: dict[Path, str] = {}
     for view, picture in pictures.items():
-        first_view = first.setdefault(picture.resolve(), view)
+        first_view = first.setdefault(real_path(picture), view)
         if first_view != view:
             found = f"{picture.name} alone for the views '{first_view}' and '{view}'"
             raise refuse(folder, found, "a picture for every view", "Keep the folders that the camera file names")

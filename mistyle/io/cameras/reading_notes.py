@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mistyle.core.asset import RAW
+from mistyle.core.paths import real_path
 from mistyle.io.cameras.captures import BELOW, WHOLE, CapturedPicture, home_of, least_alpha, source_of, tables_in
 from mistyle.io.cameras.colmap import find_model, models_below
 from mistyle.io.cameras.picture_files import as_named
@@ -60,13 +61,15 @@ def _other_names(shots: Sequence[CapturedPicture]) -> list[str]:
 
 def _left_out(shots: Sequence[CapturedPicture]) -> list[str]:
     """A sentence for each folder with pictures that no camera names: a reconstruction leaves some out."""
-    used = {path.resolve() for shot in shots for path in (shot.picture, shot.mask) if path is not None}
+    used = {real_path(path) for shot in shots for path in (shot.picture, shot.mask) if path is not None}
     kinds = defaultdict(set)
     for path in used:
         kinds[path.parent].add(path.suffix.lower())
     result = []
     for folder, endings in kinds.items():
-        rest = sorted(f.name for f in folder.iterdir() if f.suffix.lower() in endings and f.resolve() not in used)
+        rest = sorted(
+            f.name for f in folder.iterdir() if f.suffix.lower() in endings and f.is_file() and real_path(f) not in used
+        )
         if rest:
             result.append(f"{len(rest)} pictures in {folder} have no camera and were left out, such as {rest[0]}.")
     return result

@@ -5,6 +5,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core.paths import real_path
 from mistyle.io.cameras.camera_files import applied_transform
 from mistyle.io.cameras.captures import source_of
 from mistyle.io.cameras.sfm import read_landmarks
@@ -26,7 +27,7 @@ def _named_points(file: Path) -> Float[np.ndarray, "n 3"] | None:
     tree, folder = read_json(file), file.parent
     name = str(tree.get("ply_file_path") or "").replace("\\", "/")
     places = [folder / name.lstrip("/"), folder / PurePosixPath(name).name]
-    near = [place for place in places if place.is_file() and place.resolve().is_relative_to(folder.resolve())]
+    near = [place for place in places if place.is_file() and real_path(place).is_relative_to(real_path(folder))]
     if not near:
         return None
     original = np.linalg.inv(applied_transform(tree, file))

@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float
 from mistyle.core.camera import Camera, resized
 from mistyle.core.image import canny, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Lights, from_json, to_json
+from mistyle.core.paths import real_path
 from mistyle.core.view import View
 from mistyle.io.cameras.camera_files import (
     PIXELS,
@@ -183,7 +184,7 @@ def picture_of_view(
     existing = [path for ending in PICTURES if (path := folder / f"{camera.name}{ending}").is_file()]
     if entry is not None and entry.png is not None:
         named = inside(folder, entry.png, folder / "camera.json", fix)
-        if named.is_file() and named not in [path.resolve() for path in existing]:
+        if named.is_file() and named not in [real_path(path) for path in existing]:
             existing.append(named)
     written = entry.png_sha256 if entry is not None else None
     edited = [path for path in existing if path.suffix != ".png" or sha256_file(path) != written]

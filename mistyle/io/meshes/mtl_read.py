@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from mistyle.core.asset import Shading
+from mistyle.core.paths import real_path
 from mistyle.geometry.retexture import REPEAT
 from mistyle.io.images.quantisation import Kind, fractions, linear_rows
 from mistyle.io.images.read import Budget, named_alpha, named_texture
@@ -77,7 +78,7 @@ def read_library(library: Path, mesh: Path) -> tuple[dict[str, MtlEntry], tuple[
     """The materials by name, and notes. A file that is not UTF-8 is read as Windows-1252 (or Latin-1)."""
     lines = unmarked(read_bytes(library, MAX_LIBRARY_BYTES)).splitlines()
     texts, plain = decoded(*lines)
-    roots = tuple(dict.fromkeys((library.parent.resolve(), mesh.parent.resolve())))
+    roots = tuple(dict.fromkeys((real_path(library.parent), real_path(mesh.parent))))
     entries: dict[str, MtlEntry] = {}
     current = MtlEntry("", library, roots, {}, {})
     for line in texts:

@@ -8,6 +8,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.paths import real_path
 from mistyle.process.cores import in_pieces
 
 USD = (".usd", ".usda", ".usdc", ".usdz")
@@ -89,10 +90,10 @@ def inside(folder: Path, name: str, where: Path, fix: str) -> Path:
         raise refuse(where, problem, "a relative file name (nothing is fetched)", fix)
     if "\0" in plain or not plain:
         raise refuse(where, problem, "a file name", fix)
-    root = folder.resolve()
+    root = real_path(folder)
     try:
-        target = (root / plain).resolve()
-    except (OSError, RuntimeError) as error:  # a loop of links
+        target = real_path(root / plain)
+    except OSError as error:  # a loop of links
         raise refuse(where, problem, "a file name", fix) from error
     drive = re.match(r"[A-Za-z]:/", plain)
     if drive or not target.is_relative_to(root):
@@ -115,9 +116,9 @@ def beside(path: Path, reference: str) -> Path:
     if "\0" in name or not name:
         raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix)
     try:
-        roots = list(dict.fromkeys((path.parent.resolve(), path.resolve().parent)))
-        targets = [(root / name).resolve() for root in roots]
-    except (OSError, RuntimeError) as error:  # a loop of links
+        roots = list(dict.fromkeys((real_path(path.parent), real_path(path).parent)))
+        targets = [real_path(root / name) for root in roots]
+    except OSError as error:  # a loop of links
         raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix) from error
     usable = [t for t in targets if not re.match(r"[A-Za-z]:", name) and any(t.is_relative_to(r) for r in roots)]
     if not usable:

@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.paths import real_path
 from mistyle.io.sandbox.bounds import inside
 
 TEXTURES = "textures"  # folder in archives of models, in the mesh's folder or beside it
@@ -37,7 +38,7 @@ def decoded(*texts: bytes) -> tuple[list[str], bool]:
 
 def mesh_folders(path: Path) -> tuple[Path, ...]:
     """Folders of a mesh file's relative names: its own, then that of a link's target."""
-    return tuple(dict.fromkeys((path.parent.resolve(), path.resolve().parent)))
+    return tuple(dict.fromkeys((real_path(path.parent), real_path(path).parent)))
 
 
 def named_file(
@@ -61,9 +62,9 @@ def named_file(
         if target.is_file():
             return target, None
     for root in roots:
-        match = _search(root.resolve(), name, picture)
+        match = _search(real_path(root), name, picture)
         if match is not None:
-            return match, os.path.relpath(match, where.parent.resolve()).replace("\\", "/")
+            return match, os.path.relpath(match, real_path(where.parent)).replace("\\", "/")
     if refused is not None:
         raise refused
     return None, None
@@ -80,8 +81,8 @@ def _search(root: Path, name: str, picture: bool) -> Path | None:
     for folder, tail in places:
         # Links to files outside are not followed.
         target = _walk(folder, tail)
-        if target is not None and target.resolve().is_relative_to(folder) and target.is_file():
-            return target.resolve()
+        if target is not None and real_path(target).is_relative_to(folder) and target.is_file():
+            return real_path(target)
     return None
 
 

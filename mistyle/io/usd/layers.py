@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.paths import real_path
 from mistyle.io.sandbox.bounds import MAX_FILE_BYTES, USD, refuse
 
 MAX_LAYERS = 2_000
@@ -30,7 +31,7 @@ class PackagedFile:
 def place_of(layer: Any) -> PackagedFile:
     """The file, or the file in a package, of an opened layer."""
     outer, bracket, inner = str(layer.identifier).partition("[")
-    return _inside(PackagedFile(Path(outer).resolve(), inner.removesuffix("]") if bracket else ""))
+    return _inside(PackagedFile(real_path(Path(outer)), inner.removesuffix("]") if bracket else ""))
 
 
 def _inside(place: PackagedFile) -> PackagedFile:
@@ -56,8 +57,8 @@ def locate(root: Path, anchor: PackagedFile, reference: str) -> PackagedFile:
             raise refuse(anchor.file, problem, "a file inside the package", "Package the asset again")
         return PackagedFile(anchor.file, whole)
     try:
-        target = (anchor.file.parent / outer).resolve()
-    except (OSError, RuntimeError) as error:  # a loop of links
+        target = real_path(anchor.file.parent / outer)
+    except OSError as error:  # a loop of links
         raise refuse(anchor.file, problem, "a file name", COPY) from error
     if not target.is_relative_to(root):
         raise refuse(anchor.file, problem, "a file inside the mesh's own folder", COPY)
@@ -71,7 +72,7 @@ def check_layers(pxr: Any, path: Path) -> list[Path]:
     compressed or nested packages. Also refused: value clips (USD would open them later), and too many or too large
     files.
     """
-    root, start = path.resolve().parent, PackagedFile(path.resolve())
+    root, start = real_path(path).parent, PackagedFile(real_path(path))
     pending, seen = [start], {str(start)}
     files: dict[Path, int] = {}
     while pending:

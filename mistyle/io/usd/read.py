@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive, Shading
+from mistyle.core.paths import real_path
 from mistyle.io.images.read import Budget
 from mistyle.io.meshes.parsed_mesh import Raw
 from mistyle.io.meshes.polygons import too_many
@@ -55,7 +56,7 @@ class _Reading:
         key = str(material.GetPath()) if material else f"{display.albedo_factor} {shown.colour} {display.shading}"
         if key not in self._numbers:
             self._numbers[key] = len(self.materials)
-            root = self.path.resolve().parent
+            root = real_path(self.path).parent
             entry = read_material(self.pxr, material, root, self._budget, self.time, self.notes) if material else shown
             self.materials.append(entry)
         return self._numbers[key]
@@ -65,7 +66,7 @@ def files_of(path: Path) -> list[Path]:
     """The layers, packages and textures that a file depends on, including itself."""
     pxr = library()
     files = check_layers(pxr, path)
-    return [*files, *textures_named(pxr, files, path.resolve().parent)]
+    return [*files, *textures_named(pxr, files, real_path(path).parent)]
 
 
 def read_usd(path: Path, max_faces: int) -> Raw:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.asset import TURNED
+from mistyle.core.paths import real_path
 from mistyle.geometry.similarity import Y_FROM_Z
 from mistyle.io.sandbox.bounds import MAX_NODES, refuse
 from mistyle.io.usd.layers import check_layers, usd_message
@@ -22,7 +23,7 @@ def open_stage(pxr: Any, path: Path) -> Any:
     """The composed stage of a file whose layers have passed. Raises InputRefused for every composition error."""
     check_layers(pxr, path)
     try:
-        stage = pxr.Usd.Stage.Open(str(path.resolve()))
+        stage = pxr.Usd.Stage.Open(str(real_path(path)))
         errors = stage.GetCompositionErrors()
     except pxr.Tf.ErrorException as error:
         raise refuse(

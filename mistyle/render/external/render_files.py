@@ -15,6 +15,7 @@ from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.core.image import resize
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
+from mistyle.core.paths import real_path
 from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.lookdev.scenes import material_maps
 from mistyle.render.mitsuba.scene_folder import write_scene
@@ -101,7 +102,7 @@ def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     """The file for {scene} in a command: the scene file, or for a mesh a JSON that names mesh, camera, lights and an
     equal Mitsuba scene file."""
     if subject.asset is None or shot.camera is None:
-        return subject.path.resolve()
+        return real_path(subject.path)
     from mistyle.io.images.write import write_exr
 
     xml = exported(subject, shot)
@@ -111,14 +112,14 @@ def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
         write_exr(sky, dict(zip("RGB", np.moveaxis(radiance, -1, 0), strict=True)))
     matrix, _ = user_camera(subject.asset, shot.camera)
     text = {
-        "mesh": str(subject.path.resolve()),
-        "mitsuba": str(xml.resolve()),
+        "mesh": str(real_path(subject.path)),
+        "mitsuba": str(real_path(xml)),
         "size": list(shot.camera.size[::-1]),
         "fov_x": shot.camera.fov,
         "camera": matrix.tolist(),
         "axes": "OpenGL: x right, y up, z backward; the mesh file's own world",
         "suns": lookdev.suns(shot.lights, shot.camera),
-        "environment": str(sky.resolve()),
+        "environment": str(real_path(sky)),
         "environment_axes": "equirectangular as Blender reads it, after the glTF importer's turn to Z up",
         "depth": lookdev.DEPTH,
         "spp": spp,
@@ -126,7 +127,7 @@ def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     }
     path = xml.with_name(f"job_{spp}_{seed}.json")
     path.write_text(json.dumps(text, indent=1))
-    return path.resolve()
+    return real_path(path)
 
 
 def run_job(program: Sequence[str], path: Path, job: Mapping[str, Any], name: str) -> dict[str, Any]:

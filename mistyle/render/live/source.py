@@ -10,6 +10,7 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.paths import real_path
 
 Edit = tuple[int, int, str]  # first byte, byte after the last, replacement
 
@@ -78,7 +79,7 @@ def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Pat
         if e.tag == "default" and name in defines:
             text = f"<default name={quoteattr(name)} value={quoteattr(defines[name])}/>"
             edits.append((e.begin, e.end, text))
-    if out.parent.resolve() == path.parent.resolve():
+    if real_path(out.parent) == real_path(path.parent):
         return edits + [(every[0].body, every[0].body, "".join(new))] if new else edits
     for e in every:
         if e.tag == "path" and not Path(e.attributes.get("value", "/")).is_absolute():
@@ -97,9 +98,9 @@ def resolved(path: Path, defines: Mapping[str, str], out: Path) -> bytes:
 
 def _from(out: Path, folder: Path) -> str:
     try:
-        return Path(os.path.relpath(folder.resolve(), out.parent.resolve())).as_posix()
+        return Path(os.path.relpath(real_path(folder), real_path(out.parent))).as_posix()
     except ValueError:  # another drive
-        return folder.resolve().as_posix()
+        return real_path(folder).as_posix()
 
 
 def spliced(source: bytes, edits: Sequence[Edit]) -> bytes:

@@ -14,6 +14,7 @@ import numpy as np
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.names import WRITTEN, distinct, safe_name
+from mistyle.core.paths import real_path
 from mistyle.process import stopping
 from mistyle.render.live import source as scene_source
 from mistyle.render.live import text as scene_text
@@ -96,7 +97,7 @@ def _relative_to(file: Path) -> Iterator[None]:
     """Resolve relative paths beside the file, as `mi.load_file` does."""
     resolver = mi.file_resolver()
     inner = mi.FileResolver(resolver)
-    inner.prepend(str(file.parent.resolve()))
+    inner.prepend(str(real_path(file.parent)))
     mi.set_file_resolver(inner)
     try:
         yield
@@ -173,7 +174,7 @@ def write_scene(
     if difference:
         out.unlink()
         return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {difference}"))
-    if out.parent.resolve() != scene.path.parent.resolve():
+    if real_path(out.parent) != real_path(scene.path.parent):
         notes.append(f"{out.name} reads its other files from {scene.path.parent}.")
     return WrittenScene(out, textures, tuple(notes))
 

@@ -11,6 +11,7 @@ from typing import Any
 from urllib.parse import urlparse
 
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
+from mistyle.core.paths import real_path
 from mistyle.io.store.atomic import atomic_write, sha256_file
 from mistyle.process import disk_errors
 from mistyle.process.weights import converted
@@ -155,7 +156,7 @@ def _download(
 def _inside(place: Path, path: str) -> Path:
     """The local path of a repository's file; EnvironmentMissing for paths outside the folder."""
     target = place / path
-    if not target.resolve().is_relative_to(place.resolve()):
+    if not real_path(target).is_relative_to(real_path(place)):
         raise EnvironmentMissing(f"the repository names a file '{path}' outside its own folder; it was not fetched")
     return target
 

@@ -9,6 +9,7 @@ import numpy as np
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import EnvironmentMissing, UsageError
 from mistyle.core.light import Lights, SceneLights, lights
+from mistyle.core.paths import real_path
 from mistyle.core.view import View
 from mistyle.jobs.progress import Report
 from mistyle.jobs.stages import Run
@@ -51,7 +52,7 @@ def lights_of_views(settings: Settings) -> Lights | None:
     from mistyle.core.paths import scenes
 
     file = settings.draw.scene
-    if file is not None and file.resolve().parent != scenes().resolve():
+    if file is not None and real_path(file).parent != real_path(scenes()):
         return None
     view_lights = lights("paper_views" if file is None else file.stem)
     return None if any(isinstance(light, SceneLights) for light in view_lights) else view_lights
