@@ -159,7 +159,9 @@ def _add_limits(verb: argparse.ArgumentParser) -> None:
     limits.add_argument("--limits", type=Path, metavar="compare.toml", help="limits from a file, also per image")
     limits.add_argument("--allow-nonfinite", action="store_true", help="NaN and infinite pixels do not fail the gate")
     limits.add_argument(
-        "--allow-missing", action="store_true", help="pictures that only one folder has do not fail the gate"
+        "--allow-missing",
+        action="store_true",
+        help="pictures that only one folder has, and layers that only the reference has, do not fail the gate",
     )
     limits.add_argument("--baseline", type=Path, metavar="DIR", help="the approved pictures, instead of REFERENCE")
     limits.add_argument("--approve", action="append", default=[], metavar="NAME", help="copy TEST's NAME into DIR")

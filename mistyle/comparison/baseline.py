@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from mistyle.comparison.inputs import ENDINGS, pictures_of
+from mistyle.comparison.frames import ENDINGS, pictures_of
 from mistyle.core.errors import UsageError
 from mistyle.io.store.atomic import atomic_write, sha256_file
 
@@ -22,7 +22,7 @@ def approve(baseline: Path, tests: Path, patterns: Sequence[str], *, overwrite: 
     """
     if not tests.is_dir():
         raise UsageError(f"--approve takes pictures from a folder; {tests} is not a folder")
-    available = pictures_of(tests)
+    available = {name: files[0] for name, files in pictures_of(tests).items()}
     chosen: list[str] = []
     for pattern in patterns:
         matching = [name for name in available if fnmatchcase(name, pattern)]

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from mistyle.comparison.inputs import Match, Planes, chosen_layers, planes
+from mistyle.comparison.frames import Match
+from mistyle.comparison.inputs import Planes, chosen_layers, planes
 from mistyle.comparison.pictures import shown
 from mistyle.comparison.records import CompareJob
 from mistyle.core.errors import UsageError

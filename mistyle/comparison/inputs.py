@@ -1,6 +1,5 @@
-"""Pairs to compare: files and folders matched by name, layers matched by name, windows aligned."""
+"""What is compared of two pictures: layers matched by name, windows aligned, pixels masked."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,21 +8,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.errors import InputRefused
 from mistyle.core.image import resize
 from mistyle.io.images.layers import BEAUTY, Layer, LayeredPicture, Window
-
-ENDINGS = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-
-
-@dataclass(frozen=True)
-class Match:
-    """One picture of one test and its reference; one of the two is None where it is missing."""
-
-    name: str
-    test_name: str
-    reference: Path | None
-    test: Path | None
 
 
 @dataclass(frozen=True)
@@ -43,76 +30,10 @@ class Planes:
     bad: dict[str, int]
 
 
-def matches(reference: Path, tests: Sequence[Path]) -> list[Match]:
-    """Every pair to compare, test by test; folders match by relative name without extension, or by frame number.
-
-    A picture that only one folder has becomes a Match with None. InputRefused without any pair.
-    """
-    names = labels(tests)
-    if reference.is_dir():
-        files = [t for t in tests if not t.is_dir()]
-        if files:
-            raise UsageError(f"{reference} is a folder and {files[0]} is not: give folders, or one picture each")
-        return [m for name, test in zip(names, tests, strict=True) for m in _folders(reference, test, name)]
-    for path in (reference, *tests):
-        if not path.exists():
-            raise InputRefused(f"{path}: found nothing; expected a picture or a folder of frames. Check the path.")
-    pairs = []
-    for name, test in zip(names, tests, strict=True):
-        if test.is_dir():
-            raise UsageError(f"{test} is a folder and {reference} is not: give folders, or one picture each")
-        pairs.append(Match(reference.stem, name, reference, test))
-    return pairs
-
-
-def labels(tests: Sequence[Path]) -> list[str]:
-    """Short distinct names of the tests: the last parts of their paths."""
-    for depth in (1, 2, 3):
-        names = ["/".join(t.with_suffix("").parts[-depth:]) if t.suffix else "/".join(t.parts[-depth:]) for t in tests]
-        if len(set(names)) == len(names):
-            return names
-    return [f"{k}:{t.name}" for k, t in enumerate(tests)]
-
-
-def _folders(reference: Path, test: Path, label: str) -> list[Match]:
-    left, right = (pictures_of(folder) for folder in (reference, test))
-    if not left:
-        raise InputRefused(f"{reference}: found no pictures ({', '.join(ENDINGS)}); expected frames. Check the path.")
-    if not set(left) & set(right):
-        by_number = {_number(name): name for name in left}, {_number(name): name for name in right}
-        usable = len(by_number[0]) == len(left) and len(by_number[1]) == len(right) and None not in by_number[0]
-        if usable and set(by_number[0]) & set(by_number[1]):
-            right = {by_number[0].get(number, name): right[name] for number, name in by_number[1].items()}
-        else:
-            raise InputRefused(
-                f"{test}: found {len(right)} pictures, none named as one of {reference} "
-                f"({', '.join(sorted(left)[:3])}); expected equal names, or one frame number each. Rename them."
-            )
-    return [Match(name, label, left.get(name), right.get(name)) for name in sorted({*left, *right})]
-
-
-def pictures_of(folder: Path) -> dict[str, Path]:
-    """Relative name without extension -> file; EXR takes precedence over other extensions."""
-    if not folder.is_dir():
-        raise InputRefused(f"{folder}: found no folder; expected one with pictures. Check the path.")
-    pictures: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in ENDINGS and path.is_file() and not path.name.startswith("."):
-            name = path.relative_to(folder).with_suffix("").as_posix()
-            if name not in pictures or path.suffix.lower() == ".exr":
-                pictures[name] = path
-    return pictures
-
-
-def _number(name: str) -> str | None:
-    digits = re.findall(r"\d+", name.rsplit("/", 1)[-1])
-    return digits[-1].lstrip("0") or "0" if digits else None
-
-
 def chosen_layers(
     reference: LayeredPicture, test: LayeredPicture, requested: Sequence[str]
-) -> tuple[list[str], list[str]]:
-    """The names of the layers to compare, and notes about layers that only one picture has.
+) -> tuple[list[str], list[str], list[str]]:
+    """The names of the layers to compare, and of those that only the reference and only the test has.
 
     `requested` names them (InputRefused where a picture lacks one); empty: all common layers.
     """
@@ -123,16 +44,13 @@ def chosen_layers(
                 if frame.layer(name) is None:
                     available = ", ".join(layer.name for layer in frame.layers)
                     raise InputRefused(f"{frame.path}: found layers {available}; expected {name!r}. Name one of them.")
-        return list(requested), []
+        return list(requested), [], []
     both = [name for name in names if test.layer(name) is not None]
     if not both:
         theirs = ", ".join(layer.name for layer in test.layers)
         raise InputRefused(f"{test.path}: found layers {theirs}; expected one of {', '.join(names)}. Rename layers.")
-    alone = [f"layer {name!r} is in the reference only" for name in names if test.layer(name) is None]
-    alone += [
-        f"layer {layer.name!r} is in the test only" for layer in test.layers if reference.layer(layer.name) is None
-    ]
-    return both, alone
+    lost = [name for name in names if test.layer(name) is None]
+    return both, lost, [layer.name for layer in test.layers if reference.layer(layer.name) is None]
 
 
 def planes(

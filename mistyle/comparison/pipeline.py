@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.comparison.inputs import Match, Planes, alpha_mask, chosen_layers, matches, planes, read_mask, reduced
+from mistyle.comparison.frames import Match, matches
+from mistyle.comparison.inputs import Planes, alpha_mask, chosen_layers, planes, read_mask, reduced
 from mistyle.comparison.limits import broken, without_effect
 from mistyle.comparison.pictures import PairPictures, thumbnail, worst_regions, write_pictures
 from mistyle.comparison.records import CompareJob, ComparisonRow, columns, csv_text, junit_text, number, row_record
@@ -79,7 +80,7 @@ def compare(
     pictures for the page: title, src (relative) and text. Failed rows do not raise; the result lists them in
     "failures".
     """
-    pairs = matches(job.reference, job.tests)
+    pairs = matches(job.reference, job.tests, job.out)
     start, state = time.perf_counter(), ComparisonState()
     result: dict[str, Any] = {}
 
@@ -122,12 +123,24 @@ def _compare_pair(
         reference, test = read_frame(match.reference), read_frame(match.test)
         if job.protocol == "stanford-orb":
             reference = reduced(reference, test, 4)
-        names, notes = chosen_layers(reference, test, job.layers)
-        mask = _mask(job, reference)
+        names, lost, new = chosen_layers(reference, test, job.layers)
+        gate = bool(job.limits) and not job.allow_missing
+        notes = [] if gate else [f"layer {name!r} is in the reference only" for name in lost]
+        notes += [f"layer {name!r} is in the test only" for name in new]
+        mask, refused = _mask(job, reference), []
         for k, name in enumerate(names):
-            pair = _LayerPair(match, (reference, test), planes(reference, test, name, job.window, mask))
+            try:
+                pair = _LayerPair(match, (reference, test), planes(reference, test, name, job.window, mask))
+            except InputRefused as error:
+                refused.append((name, error))
+                continue
             _compare_layer(job, pair, notes, folder, state, lambda d, k=k: report((k + d) / len(names)))
             notes = []
+        if len(refused) == len(names):
+            raise refused[0][1]
+        failed = [(name, f"refused: {error}") for name, error in refused]
+        failed += [(name, "the test has no layer of this name") for name in lost if gate]
+        state.rows += [ComparisonRow(match.name, match.test_name, name, failures=(why,)) for name, why in failed]
     except InputRefused as error:
         if alone:
             raise
@@ -171,7 +184,8 @@ def _compare_layer(
         worst=worst_regions(ranked, both.mask),
         high=high,
         failures=tuple(failures),
-        notes=(*notes, *frames[0].notes, *frames[1].notes),
+        notes=(*match.notes, *notes, *frames[0].notes, *frames[1].notes),
+        files=(frames[0].path.name, frames[1].path.name),
     )
     place = f"pairs/{len(state.rows):05d}"
     thumbnail(folder / f"{place}.webp", both, error)

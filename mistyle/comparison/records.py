@@ -56,6 +56,7 @@ class ComparisonRow:
     worst      x, y, width, height, error of the worst regions, worst first
     folder     folder of its pictures, relative to the page; "" without pictures
     failures   messages; empty if it passed
+    files      names of the two files, the reference's first; empty where one is missing
     """
 
     image: str
@@ -72,6 +73,7 @@ class ComparisonRow:
     high: bool = False
     failures: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
 
 
 def number(value: float) -> float | str | None:
@@ -98,6 +100,7 @@ def row_record(row: ComparisonRow) -> dict[str, Any]:
         "high": row.high,
         "failures": list(row.failures),
         "notes": list(row.notes),
+        "files": list(row.files),
     }
 
 

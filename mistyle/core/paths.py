@@ -16,8 +16,7 @@ def scenes() -> Path:
 def real_path(path: Path) -> Path:
     """The absolute path without links; it need not exist.
 
-    Raises OSError (ELOOP) where links lead to themselves, which `Path.resolve` tells differently in every Python: up to
-    3.12 by a RuntimeError, later not at all.
+    OSError (ELOOP) where links lead to themselves: `Path.resolve` raises a RuntimeError, from Python 3.13 nothing.
     """
     real = os.path.realpath(path)
     try:

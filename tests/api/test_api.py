@@ -318,7 +318,7 @@ def test_compare_looks_inside_the_mask_and_leaves_out_what_is_no_number(rng):
     assert apart["psnr"] == np.inf and apart["relmse"] == 0 and apart.pixels == 127 and apart.bad["nan_test"] == 1
     assert "nan_test" in apart._repr_html_()
     rough = mistyle.compare(np.zeros((4, 4)), np.full((4, 4), 0.25), kind="data")
-    assert dict(rough) == {"rmse": 0.25, "mae": 0.25, "max_error": 0.25}
+    assert dict(rough) == {"rmse": 0.25, "mae": 0.25, "max_error": 0.25, "differing": 1.0}
     turned = mistyle.compare(np.eye(3)[None], np.eye(3)[[1, 2, 0]][None], kind="data")
     assert turned["angle"] == pytest.approx(90)
 

@@ -15,7 +15,7 @@ from helpers import data
 from PIL import Image
 
 from mistyle.cli.main import main
-from mistyle.comparison.inputs import matches
+from mistyle.comparison.frames import matches
 from mistyle.comparison.limits import Limit, broken
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.read import read_frame

@@ -104,7 +104,8 @@ def test_an_asset_of_the_pictures_exists_before_the_first_pass(shots, tmp_path, 
     assert marker.stat().st_mtime_ns == written
 
 
-def test_the_command_line_takes_both_limits(shots, tmp_path, capsys):
+def test_the_command_line_takes_both_limits(shots, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(jobs_plan, "slowness", lambda threads: threads / 2)
     words = ["fit", str(shots / "bowl.obj"), str(shots / "shots"), "-o", str(tmp_path / "out"), "--dry-run", "--json"]
     plans = []
     for more in ([], ["--passes", "1"], ["--minutes", "1"], ["--light", "unknown", "--photometry", "full"]):

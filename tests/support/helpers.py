@@ -51,3 +51,20 @@ def point_cloud(file: Path, points: np.ndarray) -> None:
 def assert_same(records: Sequence[Any], others: Sequence[Any]) -> None:
     """Records of arrays and numbers field by field, a NaN equal to itself; their own == cannot compare arrays."""
     np.testing.assert_equal([vars(record) for record in records], [vars(other) for other in others])
+
+
+def from_front(
+    model: str, wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5
+) -> Any:
+    """f cos(theta_o) of a reflectance model of the deferred renderer, one sided, without a normal map."""
+    from mistyle.render.deferred.bsdf import MODELS, upright
+    from mistyle.render.mitsuba.device import dr
+
+    angles = upright(wi, wo)
+    linear, constant = MODELS[model](angles, roughness, metallic, specular)
+    return dr.fma(albedo, dr.select(angles.valid, linear, 0), dr.select(angles.valid, constant, 0))
+
+
+def recordings(shader: Any) -> int:
+    """How often the frozen functions of a renderer, or of a fit's bridge, were recorded."""
+    return sum(function.n_recordings for function in shader._frozen.values())

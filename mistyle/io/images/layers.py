@@ -4,6 +4,7 @@ Colours are linear Rec.709 as stored, premultiplied by alpha (EXR is; PNG and si
 multiplied here, in linear light). Nothing is resampled, tone-mapped or clipped, and NaN and infinities stay.
 """
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -48,9 +49,11 @@ class Layer:
         return replace(self, window=data, display=shown)
 
     def values(self, window: Window | None = None) -> Float[np.ndarray, "h w c"]:
-        """float32 values over `window` (None: the display window), zero where the file has no data."""
+        """Values over `window` (None: the display window), zero where the file has no data; float32, of integers
+        float64, which holds each of them exactly."""
         x, y, width, height = window or self.display
-        result = np.zeros((height, width, len(self.planes)), np.float32)
+        whole = any(plane.dtype.kind in "iu" for plane in self.planes)
+        result = np.zeros((height, width, len(self.planes)), np.float64 if whole else np.float32)
         left, top = max(x, self.window[0]), max(y, self.window[1])
         right, bottom = (
             min(a + n, b + m) for a, n, b, m in ((x, width, *self.window[::2]), (y, height, *self.window[1::2]))
@@ -112,12 +115,33 @@ def _read_exr(path: Path) -> LayeredPicture:
     parts = hdr.parts_of_exr(path)
     groups = [group for part in parts for group in _groups(part, len(parts) > 1, path)]
     beauty = next((name for name, *_ in groups if name.rpartition(".")[2].casefold() in BEAUTY_NAMES), None)
-    layers = [layer for group in groups for layer in _split(*group, group[0] == beauty)]
+    mattes = {_text(v) for part in parts for key, v in part.header.items() if re.fullmatch("cryptomatte/.+/name", key)}
+    layers: list[Layer] = []
+    for group in groups:
+        matte = any(re.fullmatch(rf"(.*\.)?{re.escape(name)}\d\d", group[0]) for name in mattes)
+        layers += _matte(*group) if matte else _split(*group, group[0] == beauty)
     names = [layer.name.casefold() for layer in layers]
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
         raise refuse(path, f"two layers called {duplicates[0]!r}", "names that tell layers apart", "Rename one of them")
     return LayeredPicture(path, tuple(layers), True, _chromaticities(parts[0].header, path))
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _matte(name: str, planes: dict[str, np.ndarray], window: Window, display: Window) -> list[Layer]:
+    """Two ranks of Cryptomatte 1.2: IDs are bit patterns in R and B, not numbers; G and A are their coverage."""
+    upper = {channel.upper(): plane for channel, plane in planes.items()}
+    if set(upper) != set("RGBA") or any(plane.dtype != np.float32 for plane in planes.values()):
+        order = sorted(planes)
+        return [Layer(name, tuple(order), tuple(planes[c] for c in order), "data", window, display)]
+    ids = tuple(np.ascontiguousarray(upper[c]).view(np.uint32) for c in "RB")
+    return [
+        Layer(f"{name}.id", ("R", "B"), ids, "data", window, display),
+        Layer(f"{name}.coverage", ("G", "A"), (upper["G"], upper["A"]), "data", window, display),
+    ]
 
 
 def _groups(part: Any, several: bool, path: Path) -> list[tuple[str, dict[str, np.ndarray], Window, Window]]:

@@ -99,13 +99,8 @@ METRICS = {
         Metric("rmse", "lower", "", "root of the mean squared difference over mask and channels, as stored", "data"),
         Metric("mae", "lower", "", "mean absolute difference over mask and channels, as stored", "data"),
         Metric("max_error", "lower", "", "largest absolute difference over mask and channels, as stored", "data"),
-        Metric(
-            "angle",
-            "lower",
-            "degrees",
-            "mean angle between the vectors of three channels over the mask, where both are longer than 1e-6",
-            "data",
-        ),
+        Metric("differing", "lower", "0..1", "share of the mask's pixels of which any stored channel differs", "data"),
+        Metric("angle", "lower", "degrees", "mean angle between vectors of three channels longer than 1e-6", "data"),
     )
 }
 COLOUR = tuple(m.name for m in METRICS.values() if m.kind == "colour")
@@ -226,13 +221,18 @@ def measure_data(
     mask: Bool[np.ndarray, "h w"],
     names: Sequence[str] = DATA,
 ) -> MetricValues:
-    """rmse, mae, max_error and (of three channels) angle of non-colour layers; finite inside the mask."""
+    """The metrics of non-colour layers (`angle`: of three channels); finite inside the mask."""
     values = {n: math.nan for n in names if n in DATA and (n != "angle" or reference.shape[2] == 3)}
     if not mask.any():
         return MetricValues(values)
     a, b = reference[mask].astype(np.float64), test[mask].astype(np.float64)
     gap = np.abs(a - b)
-    figures = {"rmse": np.sqrt((gap**2).mean()), "mae": gap.mean(), "max_error": gap.max()}
+    figures = {
+        "rmse": np.sqrt((gap**2).mean()),
+        "mae": gap.mean(),
+        "max_error": gap.max(),
+        "differing": gap.any(axis=1).mean(),
+    }
     if "angle" in values:
         figures["angle"] = _angle(a, b)
     return MetricValues({n: float(figures[n]) for n in values})

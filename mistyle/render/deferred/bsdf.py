@@ -88,15 +88,6 @@ def upright(wi: Any, wo: Any) -> Angles:
     return _angles((0, 0, 1), (wi.x, wi.y, wi.z), (wo.x, wo.y, wo.z), True)
 
 
-def from_front(
-    model: str, wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specular: float = 0.5
-) -> Any:
-    """f cos(theta_o) of one of MODELS, one sided, without a normal map."""
-    angles = upright(wi, wo)
-    linear, constant = MODELS[model](angles, roughness, metallic, specular)
-    return dr.fma(albedo, dr.select(angles.valid, linear, 0), dr.select(angles.valid, constant, 0))
-
-
 def _angles(n: tuple, wi: tuple, wo: tuple, valid: Any) -> Angles:
     cos_i, cos_o = _dot(n, wi), _dot(n, wo)
     half = (wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2])

@@ -222,11 +222,6 @@ class MaterialRenderer:
     def _textures(self, table: Any) -> Any:
         return self.upload(table), *self._steps
 
-    @property
-    def recordings(self) -> int:
-        """Number of recordings of frozen functions so far."""
-        return sum(f.n_recordings for f in self._frozen.values())
-
     def _empty_gradient(self) -> Any:
         gradient = dr.zeros(mi.Float, COLUMNS * self.texels)
         dr.make_opaque(gradient)

@@ -58,11 +58,6 @@ class Split:
         run = self._function(("pull", moving), lit, _pull, moving)
         return np.array(run(*_arrays(lit, materials), own(mi.Float, adjoint.ravel()))).reshape(-1, 8)
 
-    @property
-    def recordings(self) -> int:
-        """Number of recordings of frozen functions so far."""
-        return sum(f.n_recordings for f in self._frozen.values())
-
     def _function(self, name: Any, lit: deferred.Lit, function: Callable, *fixed: Any) -> device.Frozen:
         key = (name, lit.size, len(lit.directional), lit.ambient is None)
         if key not in self._frozen:

@@ -15,7 +15,6 @@ from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.core.image import resize
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
-from mistyle.core.paths import real_path
 from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.lookdev.scenes import material_maps
 from mistyle.render.mitsuba.scene_folder import write_scene
@@ -102,7 +101,7 @@ def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     """The file for {scene} in a command: the scene file, or for a mesh a JSON that names mesh, camera, lights and an
     equal Mitsuba scene file."""
     if subject.asset is None or shot.camera is None:
-        return real_path(subject.path)
+        return subject.path.resolve()
     from mistyle.io.images.write import write_exr
 
     xml = exported(subject, shot)
@@ -112,14 +111,14 @@ def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
         write_exr(sky, dict(zip("RGB", np.moveaxis(radiance, -1, 0), strict=True)))
     matrix, _ = user_camera(subject.asset, shot.camera)
     text = {
-        "mesh": str(real_path(subject.path)),
-        "mitsuba": str(real_path(xml)),
+        "mesh": str(subject.path.resolve()),
+        "mitsuba": str(xml.resolve()),
         "size": list(shot.camera.size[::-1]),
         "fov_x": shot.camera.fov,
         "camera": matrix.tolist(),
         "axes": "OpenGL: x right, y up, z backward; the mesh file's own world",
         "suns": lookdev.suns(shot.lights, shot.camera),
-        "environment": str(real_path(sky)),
+        "environment": str(sky.resolve()),
         "environment_axes": "equirectangular as Blender reads it, after the glTF importer's turn to Z up",
         "depth": lookdev.DEPTH,
         "spp": spp,
@@ -127,7 +126,7 @@ def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     }
     path = xml.with_name(f"job_{spp}_{seed}.json")
     path.write_text(json.dumps(text, indent=1))
-    return real_path(path)
+    return path.resolve()
 
 
 def run_job(program: Sequence[str], path: Path, job: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -22,7 +22,6 @@ import numpy as np
 
 from mistyle.core.camera import orbit
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
-from mistyle.core.paths import real_path
 from mistyle.render.external.blender import BLENDER, blender_command
 from mistyle.render.external.render_files import (
     RenderView,
@@ -206,7 +205,7 @@ def _worker(
     folder.mkdir(parents=True, exist_ok=True)
     outs = [folder / f"{seed}.npy" for seed in seeds]
     job = {
-        "scene": str(real_path(path)),
+        "scene": str(path.resolve()),
         "sensor": shot.sensor,
         "integrator": _integrator(integrator, source),
         "variants": list(MITSUBA_VARIANTS),
@@ -230,7 +229,7 @@ def _cycles(python: str, source: Subject, shot: RenderView, spp: int, seeds: Seq
     outs = [folder / f"{seed}.exr" for seed in seeds]
     matrix, scale = user_camera(source.asset, shot.camera)
     job = {
-        "glb": str(real_path(as_glb(source))),
+        "glb": str(as_glb(source).resolve()),
         "size": list(shot.camera.size[::-1]),
         "fov_x": shot.camera.fov,
         "camera": matrix.tolist(),
@@ -238,8 +237,8 @@ def _cycles(python: str, source: Subject, shot: RenderView, spp: int, seeds: Seq
         "depth": lookdev.DEPTH,
         "threads": source.threads or os.cpu_count() or 1,
         "suns": lookdev.suns(shot.lights, shot.camera),
-        "environment": str(real_path(folder / "environment.exr")),
-        "shots": [{"out": str(real_path(o)), "spp": spp, "seed": s} for o, s in zip(outs, seeds, strict=True)],
+        "environment": str((folder / "environment.exr").resolve()),
+        "shots": [{"out": str(o.resolve()), "spp": spp, "seed": s} for o, s in zip(outs, seeds, strict=True)],
     }
     done = run_job(blender_command(python, lookdev.CYCLES_WORKER), folder / "job.json", job, "blender:cycles")
     pictures = tuple(_rgba(read_frame(o)) for o in outs)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import from_front
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.deferred import bsdf
@@ -197,7 +198,7 @@ def test_specular_equals_mitsubas(rng, specular):
     # Without a normal map and on the front only: the plain function.
     front = cases(rng, 2000, both_sides=False) | {"normal": given["normal"]}
     plain = {name: value for name, value in loaded(front).items() if name != "normal"}
-    value = np.array(bsdf.from_front("principled", **plain, specular=specular)).T
+    value = np.array(from_front("principled", **plain, specular=specular)).T
     np.testing.assert_allclose(value, ours("principled", front, specular=specular), rtol=1e-6, atol=0)
 
 
@@ -212,7 +213,7 @@ def test_gltf_equals_the_specification(rng):
     assert np.quantile(error, 0.998) < 1e-5
     front = cases(rng, 2000, both_sides=False) | {"normal": np.tile(UP, (2000, 1))}
     plain = {name: value for name, value in loaded(front).items() if name != "normal"}
-    np.testing.assert_allclose(np.array(bsdf.from_front("gltf", **plain)).T, ours("gltf", front), rtol=1e-6, atol=0)
+    np.testing.assert_allclose(np.array(from_front("gltf", **plain)).T, ours("gltf", front), rtol=1e-6, atol=0)
 
 
 def gradients(model, given, **options):
@@ -354,7 +355,7 @@ def albedo_of(model, cos_i, colour, roughness, metallic, side=256):
         density = np.maximum(wo[:, 2], 0) / np.pi + lobe
         count = len(wo)
         wide = [np.full(count, value, np.float32) for value in (*wi, *colour, roughness, metallic)]
-        value = bsdf.from_front(
+        value = from_front(
             model,
             mi.Vector3f(*wide[:3]),
             mi.Vector3f(wo.T.astype(np.float32)),

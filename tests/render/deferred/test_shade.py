@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import recordings
 from test_seam import KEY, SIZES, crop, plain_scene, random_maps, torus
 
 from mistyle.core.camera import orbit
@@ -322,7 +323,7 @@ def test_the_loop_traces_nothing_waits_for_nothing_and_records_rarely(traced, rn
     adjoint = mi.TensorXf(rng.normal(size=(32, 32, 3)).astype(np.float32))
     collected = [ours.image(k) for k in range(6)]
     monkeypatch.setattr(image_samples, "collect", None)
-    counts, start, table = [], ours.renderer.recordings, ours.table
+    counts, start, table = [], recordings(ours.renderer), ours.table
     uploaded = ours.renderer.upload(table)
     with dr.scoped_set_flag(dr.JitFlag.ForbidSynchronization, True):
         for _ in range(4):
@@ -330,7 +331,7 @@ def test_the_loop_traces_nothing_waits_for_nothing_and_records_rarely(traced, rn
             pulled = ours.pull(3, adjoint)
             ours.table = mi.TensorXf(uploaded - 0.01 * gradient.array, (len(table), 8))
             uploaded = ours.table.array
-            counts.append(ours.renderer.recordings - start)
+            counts.append(recordings(ours.renderer) - start)
     # At most two for each of six pictures' sizes and the one that is pulled, all of them at the beginning.
     assert len(collected) == 6 and counts[1] == counts[-1] <= 14
     assert np.isfinite(np.array(gradient)).all() and np.isfinite(np.array(pulled)).all() and float(value[0]) > 0

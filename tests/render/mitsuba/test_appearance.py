@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import from_front
 from PIL import Image
 from test_read_gltf import INDEX, NORMAL, POSITION, File, square
 
@@ -223,7 +224,7 @@ def test_the_layered_surface_is_gltfs_own_where_nothing_is_added() -> None:
     albedo, rough, metal = mi.Color3f(0.2, 0.5, 0.9), mi.Float(0.4), mi.Float(0.3)
     angles = bsdf.upright(wi, wo)
     layered = np.array(bsdf.layered(angles, albedo, rough, metal, mi.Color3f(bsdf.GLTF_F0), 1.0, (0.0, 0.0)))
-    own, valid = np.array(bsdf.from_front("gltf", wi, wo, albedo, rough, metal)), np.array(angles.valid)
+    own, valid = np.array(from_front("gltf", wi, wo, albedo, rough, metal)), np.array(angles.valid)
     assert valid.sum() > 5 and layered[:, valid] == pytest.approx(own[:, valid], rel=1e-4)
 
 

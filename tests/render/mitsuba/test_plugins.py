@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import from_front
 from test_bsdf import albedo_of, cases, loaded
 from test_seam import KEY, Path, crop, random_maps, tables, torus
 
@@ -81,9 +82,7 @@ def test_gltf_plugin_equals_the_function(rng, specular):
     plugin = mi.load_dict(gltf_dict(specular=specular))
     value = np.array(plugin.eval(mi.BSDFContext(), points(given), mi.Vector3f(given["wo"].T))).T
     arrays = loaded(given)
-    expected = bsdf.from_front(
-        "gltf", arrays["wi"], arrays["wo"], mi.Color3f(0.8, 0.5, 0.2), 0.4, 0.3, specular=specular
-    )
+    expected = from_front("gltf", arrays["wi"], arrays["wo"], mi.Color3f(0.8, 0.5, 0.2), 0.4, 0.3, specular=specular)
     np.testing.assert_allclose(value, np.array(expected).T, rtol=1e-5, atol=1e-9)
     assert 0.25 < (value > 0).any(-1).mean() < 0.4  # both directions in front
 

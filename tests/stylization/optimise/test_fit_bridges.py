@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import data
+from helpers import data, recordings
 from test_fit import QUICK, RESOLUTION, SIZE, correlation, painting
 from test_seam import sphere
 
@@ -75,7 +75,7 @@ def test_frozen_functions_are_recorded_once_per_phase(scene):
         counts = []
         for k in range(6):
             assert run.step(k) == ""
-            counts.append(run.shader._bridge.recordings)
+            counts.append(recordings(run.shader._bridge))
         assert counts[2] == counts[-1]
 
 

@@ -1,0 +1,121 @@
+"""What a comparison takes of folders and files: no frame, no layer and no bit passes unopened."""
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+from test_compare import picture, run, save
+
+from mistyle.comparison.frames import matches
+
+GATE = ["--metrics", "psnr,differing", "--min", "psnr=60"]
+
+
+def flat(path, value):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (16, 12), (value, 40, 90)).save(path)
+    return path
+
+
+@pytest.mark.parametrize("ending", [".png", ".tif", ".webp", ".bmp", ".tga", ".jpg", ".gif"])
+def test_folders_take_what_single_files_take(tmp_path, capsys, ending):
+    for folder, value in (("a", 10), ("b", 200)):
+        flat(tmp_path / folder / "same.png", 10)
+        flat(tmp_path / folder / f"other{ending}", value)
+    code, record, _ = run(capsys, tmp_path / "a", tmp_path / "b", "-o", tmp_path / "out", *GATE)
+    assert code == 5 and [bool(row["failures"]) for row in record["rows"]] == [True, False]
+
+
+@pytest.mark.parametrize("name", ["x.dpx", "x.pfm", "x.jxl"])
+def test_a_picture_that_cannot_be_read_fails(tmp_path, capsys, name):
+    for folder in "ab":
+        flat(tmp_path / folder / "same.png", 10)
+        (tmp_path / folder / name).write_bytes(b"of another format")
+    (tmp_path / "b" / "notes.txt").write_text("no picture")
+    code, record, said = run(capsys, tmp_path / "a", tmp_path / "b", "-o", tmp_path / "out", *GATE)
+    assert code == 5 and name in said and len(record["rows"]) == 2
+
+
+def test_files_of_one_name_are_paired_by_their_ending_and_the_rest_is_said(tmp_path, capsys, rng):
+    rgb = picture(rng)
+    for folder in "ab":
+        save(tmp_path / folder / "x.exr", rgb)
+        flat(tmp_path / folder / "x.png", 10 if folder == "a" else 200)
+        flat(tmp_path / folder / "y.png", 10)
+    save(tmp_path / "a" / "y.exr", rgb)
+    found = {m.name: (m.reference.name, m.test.name) for m in matches(tmp_path / "a", [tmp_path / "b"])}
+    assert found == {"x": ("x.exr", "x.exr"), "y": ("y.png", "y.png")}
+    _, record, said = run(capsys, tmp_path / "a", tmp_path / "b", "-o", tmp_path / "out", *GATE)
+    assert ".png of the same name left out; .exr compared" in said
+    assert record["rows"][0]["files"] == ["x.exr", "x.exr"]
+
+
+def test_pairs_by_number_are_said(tmp_path, capsys):
+    for k in (1, 2):
+        flat(tmp_path / "a" / f"lamp_{k}.png", 10)
+        flat(tmp_path / "b" / f"chair-00{k}.png", 10)
+    code, record, said = run(capsys, tmp_path / "a", tmp_path / "b", "-o", tmp_path / "out", *GATE)
+    assert code == 0 and "lamp_1.png with chair-001.png" in said
+    assert record["rows"][1]["files"] == ["lamp_2.png", "chair-002.png"]
+
+
+def test_a_comparison_within_an_input_is_not_compared_again(tmp_path, capsys):
+    for folder in "ab":
+        flat(tmp_path / folder / "1.png", 10)
+    for _ in range(2):
+        code, record, _ = run(capsys, tmp_path / "a", tmp_path / "b", "-o", tmp_path / "b" / "diff", *GATE)
+        assert code == 0 and len(record["rows"]) == 1
+
+
+def test_a_layer_that_is_gone_fails_a_gate(tmp_path, capsys, rng):
+    rgb = picture(rng)
+    depth = np.ones(rgb.shape[:2], np.float32)
+    a = save(tmp_path / "a.exr", rgb, **{"spec.V": depth, "vector.X": depth, "vector.Y": depth})
+    b = save(tmp_path / "b.exr", rgb, **{"specular.V": depth, "vector.X": depth})
+    words = (a, b, "-o", tmp_path / "out")
+    code, record, _ = run(capsys, *words, "--metrics", "psnr", "--min", "psnr=60")
+    failed = {row["layer"]: row["failures"] for row in record["rows"] if row["failures"]}
+    assert code == 5 and set(failed) == {"spec", "vector"} and "found channels X" in failed["vector"][0]
+    assert "layer 'specular' is in the test only" in str(record["notes"])
+    code, record, _ = run(capsys, *words, "--metrics", "psnr", "--min", "psnr=60", "--allow-missing")
+    assert [row["layer"] for row in record["rows"] if row["failures"]] == ["vector"]
+    assert "layer 'spec' is in the reference only" in str(record["notes"])
+
+
+def exr(path, channels, **header):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    OpenEXR.File(header, channels).write(str(path))
+    return path
+
+
+def test_whole_numbers_keep_every_bit(tmp_path, capsys):
+    for k, (one, other) in enumerate([(16777216, 16777217), (4000000000, 4000000100)]):
+        a, b = (
+            exr(tmp_path / f"{name}{k}.exr", {"id": np.full((6, 8), value, np.uint32)})
+            for name, value in (("a", one), ("b", other))
+        )
+        _, record, _ = run(capsys, a, b, "-o", tmp_path / "out")
+        (row,) = record["rows"]
+        assert row["values"]["max_error"] == other - one and row["values"]["differing"] == 1
+
+
+@pytest.mark.parametrize("names", ["RGBA", "rgba"])
+@pytest.mark.parametrize("layer", ["CryptoObject", "ViewLayer.CryptoObject"])
+def test_mattes_are_compared_by_their_bits(tmp_path, capsys, names, layer):
+    """IDs of Cryptomatte are hashes in floats: small ones would pass every colour metric, large ones fail them all."""
+    ids = np.array([0x02345678, 0x1ABCDEF1], np.uint32).view(np.float32)
+    half = np.full((6, 8), 0.5, np.float32)
+
+    def matte(path, first, second):
+        planes = dict(zip(names, (np.full_like(half, first), half, np.full_like(half, second), half), strict=True))
+        beauty = {c: half for c in "RGB"}
+        channels = beauty | {f"{layer}00.{c}": plane for c, plane in planes.items()}
+        return exr(path, channels, **{"cryptomatte/1a2b3c4/name": layer})
+
+    a, b = matte(tmp_path / "a.exr", *ids), matte(tmp_path / "b.exr", *ids[::-1])
+    _, record, _ = run(capsys, a, b, "-o", tmp_path / "out")
+    rows = {row["layer"]: row for row in record["rows"]}
+    assert set(rows) == {"beauty", f"{layer}00.id", f"{layer}00.coverage"}
+    assert all(row["kind"] == "data" for name, row in rows.items() if name != "beauty")
+    assert rows[f"{layer}00.id"]["values"]["differing"] == 1
+    assert rows[f"{layer}00.coverage"]["values"]["differing"] == 0
