@@ -131,6 +131,7 @@ def test_the_material_explains_pictures_that_were_held_out(fitted):
     assert sum(p["held_out"] for p in record["pictures"]) == 2 and len(record["pictures"]) == 24
     assert min(p["outline_overlap"] for p in record["pictures"]) == summary["figures"]["outline_overlap_least"]
     assert {"c00_0", "c11_1"} <= {p["name"] for p in record["pictures"]}
+    assert any("light of the first picture; the pictures had 2" in note for note in record["notes"])
     page = (out / "report" / "index.html").read_text()
     assert "fitted to" in page and "<svg" in page and "held out" in page
     for path in ("asset", "scene", "report", "picture"):

@@ -147,6 +147,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         results = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder, photometry)
         told = photometry.notes if photometry is not None else ()
         progress.note(*asset.source.notes, *placed.notes, *told, *recovered.notes, *old_report(job))
+        progress.note(*one_light(job.name, captures))
         if s.report.detail != "none":
             inputs = [s.report, job.name]
             run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, results, progress, r))
@@ -336,6 +337,17 @@ def lights_in_order(lights: Sequence[Lights]) -> list[int]:
             seen.append(rig)
         result.append(seen.index(rig))
     return result
+
+
+def one_light(name: str, captures: Captures) -> tuple[str, ...]:
+    """A note where the pictures had several lights: the scene file holds the first one's."""
+    count = 1 + max(lights_in_order(captures.lights))
+    moving = len(captures) > 1 and any(getattr(light, "frame", "world") == "camera" for light in captures.lights[0])
+    if count == 1 and not moving:
+        return ()
+    rest = f"the pictures had {count}" if count > 1 else "it moved with the camera"
+    return (f"scene/{name}.xml has the light of the first picture; {rest}, so the other pictures cannot all be "
+            "rendered from it.",)  # fmt: skip
 
 
 def hold_out(captures: Captures, settings: ReferenceSettings) -> tuple[list[int], list[int]]:
