@@ -62,12 +62,14 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
 
 def read_frame(path: Path) -> LayeredPicture:
     """A picture to compare: the layers of an .exr (of all its parts, whatever their windows) by name, or the one layer
-    of an .hdr, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept.
+    of an .hdr, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept. A TIFF of
+    floating-point numbers holds linear values.
 
     Checked like `read_exr` and `read_picture`: header first, bounded. Two layers of one name are refused.
     """
     path = Path(path)
-    return ask("frame", path) if path.suffix.lower() in (".exr", ".hdr") else frame_of(read_picture(path))
+    frame = ask("frame", path) if path.suffix.lower() in (".exr", ".hdr", ".tif", ".tiff") else None
+    return frame_of(read_picture(path)) if frame is None else frame
 
 
 def read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:

@@ -3,10 +3,12 @@
 import numpy as np
 import OpenEXR
 import pytest
+import tifffile
 from PIL import Image
 from test_compare import picture, run, save
 
 from mistyle.comparison.frames import matches
+from mistyle.io.read import read_picture
 
 GATE = ["--metrics", "psnr,differing", "--min", "psnr=60"]
 
@@ -119,3 +121,40 @@ def test_mattes_are_compared_by_their_bits(tmp_path, capsys, names, layer):
     assert all(row["kind"] == "data" for name, row in rows.items() if name != "beauty")
     assert rows[f"{layer}00.id"]["values"]["differing"] == 1
     assert rows[f"{layer}00.coverage"]["values"]["differing"] == 0
+
+
+@pytest.mark.parametrize("options", [{}, {"planarconfig": "separate"}, {"compression": "zlib"}])
+def test_a_tiff_of_floats_is_linear(tmp_path, capsys, rng, options):
+    rgb = 4 * picture(rng)
+    pixels = np.moveaxis(rgb, -1, 0) if "planarconfig" in options else rgb
+    tifffile.imwrite(tmp_path / "b.tif", pixels, photometric="rgb", **options)
+    a, b = save(tmp_path / "a.exr", rgb), tmp_path / "b.tif"
+    code, record, said = run(capsys, a, b, "-o", tmp_path / "out", "--metrics", "relmse,psnr", "--max", "relmse=1e-12")
+    assert code == 0 and record["rows"][0]["values"]["relmse"] == 0 and "taken as linear" in said
+
+
+def test_alpha_of_a_tiff_of_floats(tmp_path, capsys, rng):
+    rgb, alpha = picture(rng), np.full((40, 50), 0.25, np.float32)
+    a = save(tmp_path / "a.exr", rgb * 0.25, A=alpha)
+    for kind, colours in (("unassalpha", rgb), ("assocalpha", rgb * 0.25)):
+        b = tmp_path / f"{kind}.tif"
+        tifffile.imwrite(b, np.dstack([colours, alpha]), photometric="rgb", extrasamples=[kind])
+        code, record, _ = run(capsys, a, b, "-o", tmp_path / "out", "--metrics", "relmse,rmse")
+        assert code == 0 and [list(row["values"].values()) for row in record["rows"]] == [[0.0], [0.0]]
+
+
+def test_half_floats_name_the_way_out(tmp_path, capsys, rng):
+    tifffile.imwrite(tmp_path / "b.tif", picture(rng).astype(np.float16), photometric="rgb")
+    a = save(tmp_path / "a.exr", picture(rng))
+    code, _, said = run(capsys, a, tmp_path / "b.tif", "-o", tmp_path / "out")
+    assert code == 3 and "floating-point" in said and "OpenEXR" in said
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_white_may_be_zero(tmp_path, kind):
+    grey = (np.arange(12).reshape(3, 4) * 20).astype(kind) * (257 if kind is np.uint16 else 1)
+    most = np.iinfo(kind).max
+    tifffile.imwrite(tmp_path / "a.tif", most - grey, photometric="miniswhite")
+    tifffile.imwrite(tmp_path / "b.tif", grey, photometric="minisblack")
+    one, other = (read_picture(tmp_path / name).rgb for name in ("a.tif", "b.tif"))
+    np.testing.assert_array_equal(one, other)

@@ -14,6 +14,7 @@ from jaxtyping import Float, Shaped
 
 from mistyle.core.asset import Picture
 from mistyle.io.images import hdr
+from mistyle.io.images.float_tiff import read_float_tiff
 from mistyle.io.images.quantisation import linear_rows
 from mistyle.io.sandbox.bounds import refuse
 
@@ -82,8 +83,8 @@ class LayeredPicture:
         return next((layer for layer in self.layers if layer.name.casefold() == name.casefold()), None)
 
 
-def read_frame(path: Path) -> LayeredPicture:
-    """An .exr or .hdr; see io/read.py."""
+def read_frame(path: Path) -> LayeredPicture | None:
+    """An .exr, an .hdr, or a TIFF of floating-point numbers (None for other TIFFs); see io/read.py."""
     path = Path(path)
     kind = path.suffix.lower()
     if kind == ".exr":
@@ -92,7 +93,18 @@ def read_frame(path: Path) -> LayeredPicture:
         rgb = hdr.read_hdr(path)
         whole = (0, 0, rgb.shape[1], rgb.shape[0])
         return LayeredPicture(path, (Layer(BEAUTY, ("R", "G", "B"), _planes(rgb), "colour", whole, whole),), True)
-    raise refuse(path, f"a file ending in '{kind}'", "an .exr or .hdr", "Read it as a picture")
+    if kind in (".tif", ".tiff"):
+        values = read_float_tiff(path)
+        if values is None:
+            return None
+        whole = (0, 0, values.shape[1], values.shape[0])
+        layers = [Layer(BEAUTY, ("R", "G", "B"), _planes(values[..., :3]), "colour", whole, whole)]
+        if values.shape[2] == 4:
+            layers.append(Layer("alpha", ("A",), (values[..., 3],), "data", whole, whole))
+        return LayeredPicture(
+            path, tuple(layers), True, notes=("A TIFF of floating-point numbers was taken as linear.",)
+        )
+    raise refuse(path, f"a file ending in '{kind}'", "an .exr, .hdr or .tif", "Read it as a picture")
 
 
 def frame_of(picture: Picture) -> LayeredPicture:

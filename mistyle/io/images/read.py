@@ -14,6 +14,7 @@ from jaxtyping import Float, Shaped
 
 from mistyle.core.asset import Picture, Pixels
 from mistyle.core.errors import InputRefused
+from mistyle.io.images.float_tiff import holds_floats, tags_of_tiff
 from mistyle.io.images.quantisation import Kind, finished, fractions
 from mistyle.io.sandbox.bounds import MAX_PIXELS, MAX_TEXTURE_PIXELS, WORK_TEXTURE, read_bytes, refuse
 from mistyle.io.sandbox.nearby import named_file
@@ -24,7 +25,8 @@ CONVERT = "Save it as PNG or JPEG and try again"
 MAX_PICTURE_BYTES = 512 << 20
 ORIENTATION = 0x0112  # the tag of EXIF and TIFF: 1 upright, 2 mirrored, 3 turned by 180 degrees, ... 8
 EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO_SPEED = 0x8769, 0x829A, 0x829D, 0x8827
-BITS_PER_SAMPLE, PLANES, EXTRA_SAMPLES, ASSOCIATED = 258, 284, 338, 1  # TIFF 6.0; 1: colours are multiplied by alpha
+# TIFF 6.0; ASSOCIATED: colours are multiplied by alpha.
+BITS_PER_SAMPLE, PHOTOMETRIC, PLANES, EXTRA_SAMPLES, ASSOCIATED = 258, 262, 284, 338, 1
 UNDONE_BY = {6: 8, 8: 6}  # the other orientations are their own inverses
 
 
@@ -222,6 +224,9 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         raise refuse(where, "a HEIC photograph", EXPECTED, fix)
     if data[:4] == b"\x76\x2f\x31\x01" or head.startswith(b"#?r"):
         raise refuse(where, "a high-dynamic-range picture", EXPECTED, "Tone-map it and save it as PNG")
+    if holds_floats(tags_of_tiff(data)):
+        fix = "Save it as a TIFF of 16 bits, or as OpenEXR where linear values are asked for"
+        raise refuse(where, "a TIFF of floating-point numbers", EXPECTED, fix)
     Image.init()
     try:
         with warnings.catch_warnings():
@@ -410,6 +415,8 @@ def _sixteen_bit(
     orientation is Pillow's: a TIFF upright, a PNG as stored."""
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
         grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
+        if image.format == "TIFF" and image.tag_v2.get(PHOTOMETRIC) == 0:  # white is 0, which Pillow leaves so
+            grey = np.uint16(65535) - grey
         return np.repeat(grey[..., None], 3, axis=2), None
     if image.format == "TIFF":
         return _deep_tiff(data, image, where, notes)

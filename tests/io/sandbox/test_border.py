@@ -51,6 +51,7 @@ DECODERS = {
     *(
         "io/images/read",
         "io/images/hdr",
+        "io/images/float_tiff",
         "io/images/layers",
         "io/images/raw",
         "io/meshes/obj_read",
