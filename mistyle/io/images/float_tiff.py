@@ -12,7 +12,7 @@ from mistyle.io.sandbox.bounds import MAX_PIXELS, read_bytes, refuse
 
 MAX_BYTES = 1 << 30
 # Tags of TIFF 6.0, and values of them.
-WIDTH, HEIGHT, BITS, ORIENTATION, EXTRA_SAMPLES, SAMPLE_FORMAT = 256, 257, 258, 274, 338, 339
+WIDTH, HEIGHT, BITS, ORIENTATION, PLANES, EXTRA_SAMPLES, SAMPLE_FORMAT = 256, 257, 258, 274, 284, 338, 339
 FLOATS, PREMULTIPLIED = 3, (1,)
 CONVERT = "Convert it to OpenEXR (oiiotool IN.tif -o OUT.exr)"
 
@@ -42,7 +42,7 @@ def holds_floats(tags: Mapping[int, Any]) -> bool:
 def read_float_tiff(path: Path) -> Float[np.ndarray, "h w c"] | None:
     """The linear values of a TIFF of floating-point numbers, float32, three channels or four with alpha, premultiplied.
 
-    None for every other TIFF. InputRefused for 16-bit floats, turned pictures and other numbers of channels.
+    None for every other TIFF. InputRefused for 16-bit floats, planes, turned pictures and other numbers of channels.
     """
     import cv2
 
@@ -50,10 +50,12 @@ def read_float_tiff(path: Path) -> Float[np.ndarray, "h w c"] | None:
     tags = tags_of_tiff(data)
     if not holds_floats(tags):
         return None
-    found, expected = "a TIFF of floating-point numbers", "upright pixels of 32 bits, grey, RGB or RGB with alpha"
-    bits = tags.get(BITS, 1)
-    if tags.get(ORIENTATION, 1) != 1 or max(bits if isinstance(bits, tuple) else (bits,)) != 32:
-        raise refuse(path, f"{found} ({bits} bits, orientation {tags.get(ORIENTATION, 1)})", expected, CONVERT)
+    found = "a TIFF of floating-point numbers"
+    expected = "upright pixels of 32 bits side by side, grey, RGB or RGB with alpha"
+    bits, turned, planes = tags.get(BITS, 1), tags.get(ORIENTATION, 1) != 1, tags.get(PLANES, 1) != 1
+    if turned or planes or max(bits if isinstance(bits, tuple) else (bits,)) != 32:
+        what = "turned" if turned else "in separate planes" if planes else f"of {bits} bits"
+        raise refuse(path, f"{found}, {what}", expected, CONVERT)
     if not 0 < int(tags.get(WIDTH, 0)) * int(tags.get(HEIGHT, 0)) <= MAX_PIXELS:
         raise refuse(path, "too many pixels", f"1 to {MAX_PIXELS / 1e6:.0f} million", "Scale the picture down")
     try:
