@@ -184,7 +184,7 @@ def _compare_layer(
         worst=worst_regions(ranked, both.mask),
         high=high,
         failures=tuple(failures),
-        notes=(*match.notes, *notes, *frames[0].notes, *frames[1].notes),
+        notes=(*match.notes, *notes, *_of_files(*frames)),
         files=(frames[0].path.name, frames[1].path.name),
     )
     place = f"pairs/{len(state.rows):05d}"
@@ -193,6 +193,13 @@ def _compare_layer(
         state.written[place] = write_pictures(folder / place, both, measured.maps, high)
         row = replace(row, folder=place)
     state.rows.append(row)
+
+
+def _of_files(reference: LayeredPicture, test: LayeredPicture) -> list[str]:
+    """The notes of reading both files, each with the file that it is about."""
+    texts = dict.fromkeys((*reference.notes, *test.notes))
+    who = {text: [w for w, f in (("reference", reference), ("test", test)) if text in f.notes] for text in texts}
+    return [f"{' and '.join(who[text])}: {text}" for text in texts]
 
 
 def _measure(

@@ -161,3 +161,18 @@ def test_white_may_be_zero(tmp_path, kind):
     tifffile.imwrite(tmp_path / "b.tif", grey, photometric="minisblack")
     one, other = (read_picture(tmp_path / name).rgb for name in ("a.tif", "b.tif"))
     np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(("chunk", "value", "said"), [
+    (b"gAMA", (100000).to_bytes(4, "big"), True),
+    (b"gAMA", (45455).to_bytes(4, "big"), False),
+    (b"cICP", bytes([9, 16, 0, 1]), True),
+    (b"cICP", bytes([1, 13, 0, 1]), False),
+])  # fmt: skip
+def test_other_colours_of_a_png_are_said(tmp_path, chunk, value, said):
+    from PIL import PngImagePlugin
+
+    more = PngImagePlugin.PngInfo()
+    more.add(chunk, value)
+    Image.new("RGB", (8, 6), (90, 40, 10)).save(tmp_path / "a.png", pnginfo=more)
+    assert bool([note for note in read_picture(tmp_path / "a.png").notes if chunk.decode() in note]) == said

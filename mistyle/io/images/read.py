@@ -23,6 +23,7 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "TGA")
 EXPECTED = "a PNG, JPEG, WebP, TIFF, BMP, GIF or TGA picture"
 CONVERT = "Save it as PNG or JPEG and try again"
 MAX_PICTURE_BYTES = 512 << 20
+CHUNKS = 1 << 12  # bytes of a PNG in which chunks of colour lie
 ORIENTATION = 0x0112  # the tag of EXIF and TIFF: 1 upright, 2 mirrored, 3 turned by 180 degrees, ... 8
 EXIF_IFD, EXPOSURE_TIME, F_NUMBER, ISO_SPEED = 0x8769, 0x829A, 0x829D, 0x8827
 # TIFF 6.0; ASSOCIATED: colours are multiplied by alpha.
@@ -247,7 +248,19 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
     notes = (
         [f"Only the {first_parts.get(str(image.format), 'first frame of the animation')} was read."] if several else []
     )
-    return image, notes
+    return image, [*notes, *_png_notes(image, data)]
+
+
+def _png_notes(image: Any, data: bytes) -> list[str]:
+    """What a PNG without a profile says of its colours besides sRGB; nothing of it is applied."""
+    if image.format != "PNG" or "icc_profile" in image.info:
+        return []
+    gamma, at = image.info.get("gamma"), data[:CHUNKS].find(b"cICP") + 4
+    other = gamma is not None and "srgb" not in image.info and abs(gamma - 1 / 2.2) > 0.005
+    # ITU-T H.273: primaries 1 are Rec.709, transfer 13 is sRGB and 1 Rec.709.
+    coded = at >= 4 and (data[at] != 1 or data[at + 1] not in (1, 13))
+    return [f"Its {name} chunk was ignored; colours are taken as sRGB." for name, there in
+            (("gAMA", other), ("cICP", coded)) if there]  # fmt: skip
 
 
 def _heic_decoder() -> bool:
