@@ -53,6 +53,20 @@ def chosen_layers(
     return both, lost, [layer.name for layer in test.layers if reference.layer(layer.name) is None]
 
 
+def window_notes(frame: LayeredPicture) -> list[str]:
+    """What the display window hides of a file's pixels, and where it has none."""
+    beyond = [layer for layer in frame.layers if _outside(layer.window, layer.display)]
+    empty = [layer for layer in frame.layers if _outside(layer.display, layer.window)]
+    notes = ["pixels outside the display window were not compared (--window overlap does)"] if beyond else []
+    return notes + ["pixels without data in the display window count as 0"] * bool(empty)
+
+
+def _outside(inner: Window, outer: Window) -> bool:
+    """Whether a window has pixels outside another one."""
+    (x, y, width, height), (left, top, wide, high) = inner, outer
+    return x < left or y < top or x + width > left + wide or y + height > top + high
+
+
 def planes(
     reference: LayeredPicture,
     test: LayeredPicture,

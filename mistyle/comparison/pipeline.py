@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.comparison.frames import Match, matches
-from mistyle.comparison.inputs import Planes, alpha_mask, chosen_layers, planes, read_mask, reduced
+from mistyle.comparison.inputs import Planes, alpha_mask, chosen_layers, planes, read_mask, reduced, window_notes
 from mistyle.comparison.limits import broken, without_effect
 from mistyle.comparison.pictures import PairPictures, thumbnail, worst_regions, write_pictures
 from mistyle.comparison.records import CompareJob, ComparisonRow, columns, csv_text, junit_text, number, row_record
@@ -121,6 +121,8 @@ def _compare_pair(
 
     try:
         reference, test = read_frame(match.reference), read_frame(match.test)
+        if job.window == "display":
+            reference, test = (replace(f, notes=(*f.notes, *window_notes(f))) for f in (reference, test))
         if job.protocol == "stanford-orb":
             reference = reduced(reference, test, 4)
         names, lost, new = chosen_layers(reference, test, job.layers)

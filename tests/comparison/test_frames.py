@@ -176,3 +176,16 @@ def test_other_colours_of_a_png_are_said(tmp_path, chunk, value, said):
     more.add(chunk, value)
     Image.new("RGB", (8, 6), (90, 40, 10)).save(tmp_path / "a.png", pnginfo=more)
     assert bool([note for note in read_picture(tmp_path / "a.png").notes if chunk.decode() in note]) == said
+
+
+def test_what_the_display_window_hides_is_said(tmp_path, capsys, rng):
+    rgb = picture(rng, 12, 16)
+    header = {"dataWindow": ((-2, -2), (13, 9)), "displayWindow": ((0, 0), (9, 7))}
+    a, b = (
+        exr(tmp_path / name, dict(zip("RGB", np.moveaxis(rgb * f, -1, 0).copy(), strict=True)), **header)
+        for name, f in (("a.exr", 1), ("b.exr", 1))
+    )
+    _, record, said = run(capsys, a, b, "-o", tmp_path / "out", "--metrics", "psnr")
+    assert record["rows"][0]["size"] == [10, 8] and "outside the display window were not compared" in said
+    _, record, said = run(capsys, a, b, "-o", tmp_path / "out", "--metrics", "psnr", "--window", "overlap")
+    assert record["rows"][0]["size"] == [16, 12] and "outside the display" not in said
