@@ -28,6 +28,7 @@ from mistyle.fitting.pipeline.passes import recovered_maps
 from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import pixels_of, read_averaged, write_averaged
 from mistyle.fitting.pipeline.times import running
+from mistyle.fitting.pipeline.unseen import refuse_unseen
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs.edits import asset_stage, tell_edits
@@ -130,6 +131,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
         fitted, _ = hold_out(whole, s.references)
+        refuse_unseen(job, asset, subset(whole, fitted))
         first_asset(run, asset, texels, subset(whole, fitted))
         captures, placed, photometry = explained_pictures(run, asset, texels, (whole, placed), shots)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
