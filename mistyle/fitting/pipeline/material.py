@@ -306,7 +306,18 @@ def with_light(run: Run, asset: Asset, captures: Captures, found: Any = None) ->
     estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)
     if s.light.sun and estimate.sun is None:
         run.progress.note("No direction of a sun explains the shading: the light is an environment alone.")
+    run.progress.note(*scale_notes(run.job))
     return replace(captures, lights=tuple(estimate.lights for _ in captures.cameras))
+
+
+def scale_notes(job: MaterialJob) -> tuple[str, ...]:
+    """A note where nothing fixes the scale and colour of a light that is solved."""
+    if job.lights != "unknown" or (job.albedo_of is not None and job.settings.light.albedo is not None):
+        return ()
+    return (
+        "The pictures hardly determine an unknown light's scale and colour, so all albedo may be too dark, too bright "
+        "or tinted: --albedo-of MASK=VALUE fixes both by a surface of known albedo, such as a grey card.",
+    )
 
 
 def with_known_albedo(run: Run, asset: Asset, captures: Captures, found: Any) -> Any:
