@@ -1,5 +1,6 @@
 """`mistyle fit` as a user runs it: from a folder of pictures to an asset, a Mitsuba scene and a report."""
 
+import html
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.fitting.light import unknown_light
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
-from mistyle.fitting.pipeline.material import hold_out, lights_in_order, place, references_of
+from mistyle.fitting.pipeline.material import hold_out, lights_in_order, place, references_of, scale_notes
 from mistyle.fitting.pipeline.outlines import report_placement
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.cameras.views import read_views, write_views
@@ -272,6 +273,16 @@ def test_a_light_that_nobody_knows(shots, tmp_path, monkeypatch):
     )  # fmt: skip
     assert summary["figures"]["psnr_held_out"] > 30
     assert "envmap" in Path(summary["scene"]).read_text()
+    (free,) = scale_notes(MaterialJob(Path("a"), Path("b"), Path("c"), MaterialSettings(), "a", "unknown"))
+    assert "--albedo-of" in free and free in summary["notes"]
+    assert free.partition(":")[0] in html.unescape((tmp_path / "out" / "report" / "index.html").read_text())
+
+
+def test_a_scale_that_something_fixes_needs_no_note():
+    lit = MaterialSettings.model_validate({"light": {"albedo": (0.18, 0.18, 0.18)}})
+    carded = MaterialJob(Path("a"), Path("b"), Path("c"), lit, "a", "unknown", albedo_of=Path("m.png"))
+    assert scale_notes(carded) == scale_notes(replace(carded, lights=None, albedo_of=None)) == ()
+    assert scale_notes(replace(carded, settings=MaterialSettings())) != ()
 
 
 def test_pictures_are_held_out_evenly_and_by_light():

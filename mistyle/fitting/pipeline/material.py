@@ -28,6 +28,7 @@ from mistyle.fitting.pipeline.passes import recovered_maps
 from mistyle.fitting.pipeline.photometry import match_exposures
 from mistyle.fitting.pipeline.pictures import pixels_of, read_averaged, write_averaged
 from mistyle.fitting.pipeline.times import running
+from mistyle.fitting.pipeline.unseen import refuse_unseen
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs.edits import asset_stage, tell_edits
@@ -130,6 +131,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
         fitted, _ = hold_out(whole, s.references)
+        refuse_unseen(job, asset, subset(whole, fitted))
         first_asset(run, asset, texels, subset(whole, fitted))
         captures, placed, photometry = explained_pictures(run, asset, texels, (whole, placed), shots)
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
@@ -305,7 +307,18 @@ def with_light(run: Run, asset: Asset, captures: Captures, found: Any = None) ->
     estimate = run.record("light", ["pictures"], [s.recover, s.light, card], solved)
     if s.light.sun and estimate.sun is None:
         run.progress.note("No direction of a sun explains the shading: the light is an environment alone.")
+    run.progress.note(*scale_notes(run.job))
     return replace(captures, lights=tuple(estimate.lights for _ in captures.cameras))
+
+
+def scale_notes(job: MaterialJob) -> tuple[str, ...]:
+    """A note where nothing fixes the scale and colour of a light that is solved."""
+    if job.lights != "unknown" or (job.albedo_of is not None and job.settings.light.albedo is not None):
+        return ()
+    return (
+        "The pictures hardly determine an unknown light's scale and colour, so all albedo may be too dark, too bright "
+        "or tinted: --albedo-of MASK=VALUE fixes both by a surface of known albedo, such as a grey card.",
+    )
 
 
 def with_known_albedo(run: Run, asset: Asset, captures: Captures, found: Any) -> Any:

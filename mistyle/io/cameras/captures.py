@@ -20,7 +20,7 @@ The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops t
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -42,6 +42,7 @@ from mistyle.io.cameras.picture_files import (
     ADD,
     COPY,
     HAND_IN,
+    by_spelling,
     check_different,
     find,
     find_by_end,
@@ -132,8 +133,7 @@ def read_captures(
     than their camera, views without lights, masks or exposures for some views only. `check_pixels` checks the values.
     """
     shots = read_shots(path, masks=masks, exposure=exposure, pictures=pictures)
-    names = [shot.camera.name for shot in shots]
-    rig = tuple(() for _ in names) if lights == "unknown" else _lights(home_of(path), lights, names)
+    rig = tuple(() for _ in shots) if lights == "unknown" else _lights(home_of(path), lights, _spelled(shots))
 
     @lru_cache(maxsize=KEPT)
     def load(k: int) -> Loaded:
@@ -184,7 +184,7 @@ def read_shots(
         named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
         shots = [_shot(frame, place(frame.picture), mask) for frame, mask in zip(frames, named, strict=True)]
     check_different({shot.camera.name: shot.picture for shot in shots}, elsewhere or home_of(Path(path)))
-    factors = _factors(exposure, [shot.camera.name for shot in shots])
+    factors = _factors(exposure, _spelled(shots))
     result = []
     for shot, factor in zip(shots, factors, strict=True):
         mask = shot.mask if masks is None else mask_of_view(Path(masks), shot.camera.name, shot.picture)
@@ -391,7 +391,13 @@ def _checked(picture: Path, shot: CapturedPicture) -> int:
     return orientation
 
 
-def _lights(home: Path, file: Path | None, names: list[str]) -> tuple[Lights, ...]:
+def _spelled(shots: Sequence[CapturedPicture]) -> dict[str, str]:
+    """The pictures' names as the camera file spells them, by the views' names."""
+    return {shot.camera.name: shot.named or shot.camera.name for shot in shots}
+
+
+def _lights(home: Path, file: Path | None, spelled: Mapping[str, str]) -> tuple[Lights, ...]:
+    names = list(spelled.values())
     path = Path(file) if file is not None else home / "lights.json"
     if not path.is_file():
         fix = (
@@ -406,20 +412,23 @@ def _lights(home: Path, file: Path | None, names: list[str]) -> tuple[Lights, ..
             maps[name] = read_radiance(inside(path.parent, name, path, COPY))
         return maps[name]
 
-    return lights_of_views(read_json(path), names, str(path), load)
+    tree = read_json(path)
+    if isinstance(tree.get("views"), dict):
+        tree = tree | {"views": by_spelling(tree["views"], spelled, path)}
+    return lights_of_views(tree, names, str(path), load)
 
 
-def _factors(exposure: Path | Mapping[str, float] | None, names: list[str]) -> list[float]:
+def _factors(exposure: Path | Mapping[str, float] | None, spelled: Mapping[str, str]) -> list[float]:
     """The exposure factor of each picture's radiance."""
     if exposure is None:
-        return [1.0] * len(names)
+        return [1.0] * len(spelled)
     where = exposure if isinstance(exposure, Path | str) else "exposure"
     tree: Mapping[str, Any] = read_json(Path(where)) if isinstance(exposure, Path | str) else exposure
     table = tree.get("factor", tree.get("ev", tree))
     if not isinstance(table, Mapping):
         raise refuse(where, f"a {type(table).__name__}", "an object: picture -> number", "Correct the file")
-    factors = []
-    for name in names:
+    factors, table = [], by_spelling(table, spelled, where)
+    for name in spelled.values():
         value = table.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise refuse(where, f"{value!r} for the view '{name}'", "a number for every view", "Add it")

@@ -6,6 +6,7 @@ another. Only files in the folder of the pictures are opened: the end of a name 
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.paths import real_path
@@ -74,6 +75,29 @@ def as_named(picture: Path, name: str) -> bool:
 
 def _endings_of(name: str) -> list[str]:
     return [f"{name}{e}" for ending in ENDINGS for e in (ending, ending.upper())]
+
+
+def by_spelling(table: Mapping[str, Any], spelled: Mapping[str, str], where: object) -> dict[str, Any]:
+    """The user's `table` of views under the names of the camera file, which `spelled` has by our own names. The user
+    may write either, with or without a picture's ending; names of no view stay. Refused: two names of one view."""
+    whole = {_plain(name): name for name in spelled.values()}
+    short = [stem(name) for name in whole]
+    alike = {stem(plain): name for plain, name in whole.items() if short.count(stem(plain)) == 1}
+    ways = alike | {ours: name for ours, name in spelled.items()} | whole
+    result: dict[str, Any] = {}
+    first: dict[str, str] = {}
+    for key, value in table.items():
+        plain = _plain(key)
+        name = ways.get(plain) or ways.get(stem(plain)) or key
+        if first.setdefault(name, key) != key:
+            found = f"{first[name]!r} and {key!r} for the view {name!r}"
+            raise refuse(Path(str(where)), found, "one entry for each view", "Leave one of them out")
+        result[name] = value
+    return result
+
+
+def _plain(name: str) -> str:
+    return str(PurePosixPath(name.replace("\\", "/")))
 
 
 def named_mask(places: Sequence[Path], name: str, file: Path) -> Path:

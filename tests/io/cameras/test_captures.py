@@ -182,7 +182,10 @@ def test_exposures(tmp_path):
         assert captures.load(k)[0] == pytest.approx(plain / 2**stops)
     (tmp_path / "f.json").write_text('{"factor": {"v0": 4, "v1": 0.5, "v2": 1}}')
     assert read_captures(tmp_path, exposure=tmp_path / "f.json").load(0)[0] == pytest.approx(plain / 4)
-    for table, reason in (({"v0": 1}, "for the view 'v1'"), ({"factor": {"v0": 0, "v1": 1, "v2": 1}}, "factor > 0")):
+    for table, reason in (
+        ({"v0": 1}, "for the view './images/v1.png'"),
+        ({"factor": {"v0": 0, "v1": 1, "v2": 1}}, "factor > 0"),
+    ):
         (tmp_path / "bad.json").write_text(json.dumps(table))
         with pytest.raises(InputRefused, match=reason):
             read_captures(tmp_path, exposure=tmp_path / "bad.json")
@@ -207,10 +210,10 @@ def test_lights_of_every_kind_beside_or_elsewhere(tmp_path):
     with pytest.raises(InputRefused, match="inside"):
         read_captures(tmp_path, lights=tmp_path / "rig" / "night.json")
     (tmp_path / "lights.json").unlink()
-    with pytest.raises(InputRefused, match='the light of each picture.*"views": {"v0": .*directional'):
+    with pytest.raises(InputRefused, match='the light of each picture.*"views": {"./images/v0.png": .*directional'):
         read_captures(tmp_path)
     (tmp_path / "lights.json").write_text(json.dumps({"views": {"v0": [flash]}}))
-    with pytest.raises(InputRefused, match="no lights for the view 'v1' .2 of 3"):
+    with pytest.raises(InputRefused, match="no lights for the view './images/v1.png' .2 of 3"):
         read_captures(tmp_path)
 
 
@@ -299,6 +302,35 @@ def test_pictures_of_one_name_in_several_folders(tmp_path):
     captures = read_captures(tmp_path)
     assert [c.name for c in captures.cameras] == ["cam0_0001", "cam1_0001"]
     assert captures.load(0)[0].mean() < captures.load(1)[0].mean()
+
+
+@pytest.mark.parametrize(
+    "spelling", ["cam{}/0001.png", "cam{}/0001", "./cam{}/0001.png", "cam{}\\0001.PNG", "cam{}_0001"]
+)
+def test_lights_and_exposures_by_the_camera_files_names(tmp_path, spelling):
+    nerf(tmp_path, [grey(0.25), grey(0.75)])
+    tree = json.loads((tmp_path / "transforms.json").read_text())
+    for k, frame in enumerate(tree["frames"]):
+        frame["file_path"] = f"cam{k}/0001.png"
+        (tmp_path / f"cam{k}").mkdir()
+        (tmp_path / "images" / f"v{k}.png").rename(tmp_path / f"cam{k}" / "0001.png")
+    (tmp_path / "transforms.json").write_text(json.dumps(tree))
+    rigs = [[{"type": "ambient", "radiance": [k + 1.0] * 3}] for k in range(2)]
+    lights = tmp_path / "lights.json"
+    lights.write_text(json.dumps({"lights": [], "views": {spelling.format(k): rigs[k] for k in range(2)}}))
+    captures = read_captures(tmp_path, exposure={spelling.format(k): float(k) for k in range(2)})
+    assert [rig[0].radiance[0] for rig in captures.lights] == [1.0, 2.0]
+    plain = read_captures(tmp_path)
+    assert captures.load(1)[0] == pytest.approx(plain.load(1)[0] / 2)
+    lights.write_text(json.dumps({"lights": [], "views": {"0001": rigs[0]}}))
+    with pytest.raises(InputRefused, match="names '0001', which is not one of the 2 views .'cam0/0001.png'"):
+        read_captures(tmp_path)
+    lights.write_text(json.dumps({"views": {spelling.format(0): rigs[0]}}))
+    with pytest.raises(InputRefused, match="no lights for the view 'cam1/0001.png'"):
+        read_captures(tmp_path)
+    lights.write_text(json.dumps({"views": {spelling.format(0): rigs[0], "cam0/0001.jpg": rigs[1]}}))
+    with pytest.raises(InputRefused, match="'cam0/0001.jpg' for the view 'cam0/0001.png'"):
+        read_captures(tmp_path)
 
 
 def test_the_lens_is_opencvs(rng):
