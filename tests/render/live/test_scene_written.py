@@ -56,8 +56,8 @@ OTHERS = {
     "medium": '<shape type="sphere" id="x"><bsdf type="null"/><medium type="homogeneous" name="interior">'
     '<rgb name="albedo" value="0.2,0.3,0.4"/><phase type="hg"><float name="g" value="0.2"/></phase></medium></shape>',
     "volume": '<shape type="sphere" id="x"><bsdf type="null"/><medium type="heterogeneous" name="exterior">'
-    '<volume name="albedo" type="constvolume"><rgb name="value" value="0.2 0.3 0.4"/></volume><phase type="blendphase"><float name="weight" '
-    'value="0.3"/><phase type="hg"/><phase type="tabphase"><string name="values" value="0.1,0.2,0.3,0.2"/></phase>'
+    '<volume name="albedo" type="constvolume"><rgb name="value" value="0.2 0.3 0.4"/></volume><phase type="blendphase">'
+    '<float name="weight" value="0.3"/><phase type="hg"/><phase type="tabphase"><string name="values" value="0.1,0.2,0.3,0.2"/></phase>'
     "</phase></medium></shape>",
 }
 
