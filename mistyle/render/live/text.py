@@ -8,8 +8,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from mistyle.io.scene_source import Edit, Element, elements_of
 from mistyle.render.live.parameters import Parameter
-from mistyle.render.live.source import Edit, Element, elements_of
 from mistyle.render.mitsuba.device import mi
 
 # Plugins that read two indices of refraction; `mi.traverse` has their ratio `eta`.
@@ -19,9 +19,8 @@ PARTNERS = {("conductor", "eta"): "k", ("conductor", "k"): "eta", ("spot", "cuto
 PARTNERS |= {("roughconductor", name): other for (plugin, name), other in PARTNERS.items() if plugin == "conductor"}
 # Names of children in `mi.traverse` and in the file, and of children that need no name there.
 READ_AS = {"interior_medium": "interior", "exterior_medium": "exterior"}
-KINDS = dict.fromkeys(("bsdf", "brdf", "nested_bsdf"), "BSDF")
-KINDS |= {"phase": "PhaseFunction", "phase_function": "PhaseFunction", "emitter": "Emitter", "shape": "Shape"}
-KINDS |= {"normalmap": "Texture", "nested_texture": "Texture"}
+KINDS = {"bsdf": "BSDF", "brdf": "BSDF", "nested_bsdf": "BSDF", "emitter": "Emitter", "phase": "PhaseFunction"}
+KINDS |= {"phase_function": "PhaseFunction", "normalmap": "Texture", "nested_texture": "Texture", "shape": "Shape"}
 
 
 def children(node: Any) -> list[tuple[str, int]]:
@@ -114,9 +113,9 @@ def _file_edits(elements: Sequence[Element], at: int, file: Path | None) -> list
     if file is None or "filename" not in inner:
         return "its texture has no file name that could be replaced."
     old = inner["filename"]
-    edits = [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>')]
     # An 8-bit or 16-bit format would round the file's values.
-    return edits + [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
+    dropped = [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
+    return [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>'), *dropped]
 
 
 def _literal_edits(

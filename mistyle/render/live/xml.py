@@ -15,8 +15,8 @@ import numpy as np
 from mistyle.core.errors import InputRefused
 from mistyle.core.names import WRITTEN, distinct, safe_name
 from mistyle.core.paths import real_path
+from mistyle.io import scene_source
 from mistyle.process import stopping
-from mistyle.render.live import source as scene_source
 from mistyle.render.live import text as scene_text
 from mistyle.render.live.parameters import Parameter
 from mistyle.render.mitsuba import device
@@ -163,9 +163,9 @@ def write_scene(
     included: list[str] = []
 
     def attempt(chosen: Sequence[Parameter]) -> str:
-        """Write the scene file with the values of some parameters; the first difference when it is loaded."""
+        """Write the scene file with the values of these parameters, if any; the first difference when it is loaded."""
         for file in files:
-            file.unlink()
+            file.unlink(missing_ok=True)
         files.clear()
         edits: dict[int, list[scene_source.Edit]] = {0: []}
         for p in chosen:
@@ -173,9 +173,9 @@ def write_scene(
         included[:] = _rewrite_includes(scene, sources, edits, out, files.__setitem__)
         edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
         files[out] = scene_source.spliced(sources[0], edits[0])
-        for file, text in files.items():
+        for file, text in files.items() if chosen else ():
             write_file(file, text)
-        return _differences(out, fitted, chosen)
+        return _differences(out, fitted, chosen) if chosen else ""
 
     kept, wrong = _accepted(attempt, [p for p in fitted.parameters if p not in notes])
     notes |= wrong
@@ -193,12 +193,10 @@ def _accepted(
     """The parameters whose values a scene file holds, all together or else those that it holds alone, and the
     reasons against the others. The last attempt is that of the accepted ones."""
     wrong: dict[Parameter, str] = {}
-    while chosen and (why := attempt(chosen)):
+    while why := attempt(chosen):
         alone = {p: attempt([p]) for p in chosen} if len(chosen) > 1 and not wrong else dict.fromkeys(chosen, why)
         bad = {p: reason for p, reason in alone.items() if reason} or dict.fromkeys(chosen, why)
         wrong, chosen = wrong | bad, [p for p in chosen if p not in bad]
-    if not chosen and wrong:
-        attempt([])
     return chosen, wrong
 
 
@@ -260,7 +258,7 @@ def _differences(out: Path, fitted: Any, chosen: Sequence[Parameter]) -> str:
     try:
         loaded = load_scene_for_fit(out)
     except InputRefused as error:
-        return f"Mitsuba does not load the file with it ({str(error).strip().splitlines()[-1].strip()})."
+        return f"Mitsuba does not load the file with it ({' '.join(str(error).split())})."
     table = mi.traverse(loaded.scene)
     for p in chosen:
         if p.key not in table:

@@ -5,9 +5,9 @@ random numbers. It solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ 
 the expected I is R, so any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds with
 the J of others, so it has no bias from J's noise.
 
-The first rounds are short and approach the solution. They share their random numbers: the difference of two noisy
-losses has little noise then, and a step is kept only if the loss falls. The rest share the remaining steps and do not replace one another:
-the result is the mean of their solutions, and their disagreement its standard error.
+The first rounds are short and approach the solution. They share their random numbers, so that the difference of two
+noisy losses has little noise, and a step is kept only if the loss falls. The rest share the remaining steps and do not
+replace one another: the result is the mean of their solutions, and their disagreement its standard error.
 """
 
 import math
@@ -191,9 +191,9 @@ def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) 
         pictures = []
         for end in ends:
             scene_grad.put(job.table, job.chosen, spread(job, end, fill))
-            shown = np.array(scene_grad.picture(job.scene, job.engine, sensor, spp, seed))[..., :3]
-            pictures.append(np.where(np.isfinite(shown), shown, np.float32(0)))
-        result.append((pictures[1] - pictures[0]) / np.float32((ends[1] - ends[0])[n]))
+            pictures.append(np.array(scene_grad.picture(job.scene, job.engine, sensor, spp, seed))[..., :3])
+        slope = (pictures[1] - pictures[0]) / np.float32((ends[1] - ends[0])[n])
+        result.append(np.where(np.isfinite(slope), slope, np.float32(0)))
     return np.stack(result)
 
 

@@ -57,8 +57,8 @@ OTHERS = {
     '<rgb name="albedo" value="0.2,0.3,0.4"/><phase type="hg"><float name="g" value="0.2"/></phase></medium></shape>',
     "volume": '<shape type="sphere" id="x"><bsdf type="null"/><medium type="heterogeneous" name="exterior">'
     '<volume name="albedo" type="constvolume"><rgb name="value" value="0.2 0.3 0.4"/></volume><phase type="blendphase">'
-    '<float name="weight" value="0.3"/><phase type="hg"/><phase type="tabphase"><string name="values" value="0.1,0.2,0.3,0.2"/></phase>'
-    "</phase></medium></shape>",
+    '<float name="weight" value="0.3"/><phase type="hg"/><phase type="tabphase">'
+    '<string name="values" value="0.1,0.2,0.3,0.2"/></phase></phase></medium></shape>',
 }
 
 
@@ -69,8 +69,8 @@ def moved(p, value):
     return np.clip(value * 0.9 + np.float32(0.03), low + 0.01, high - 0.01).astype(np.float32)
 
 
-def written(folder, text, without=""):
-    """Load a scene, change all numbers but one, write it; the result, the live scene's table and the parameters."""
+def written(folder, text, without="", only=""):
+    """Load a scene, change numbers (all but one, or one), write it; the result, live table and parameters."""
     import mitsuba as mi
 
     device.use()
@@ -78,6 +78,7 @@ def written(folder, text, without=""):
     loaded = scene_xml.load_scene_for_fit(folder / "scene.xml")
     table = mi.traverse(loaded.scene)
     chosen = [p for p in scene_keys.parameters(loaded.scene) if p.kind == "value" and p.name != without]
+    chosen = [p for p in chosen if only in ("", p.name)]
     chosen = [p for p in chosen if p.reason is None or "gradient" in p.reason]
     values = {p.key: moved(p, table[p.key]) for p in chosen}
     scene_grad.put(table, chosen, values)
@@ -105,3 +106,10 @@ def test_a_scene_that_holds_no_fitted_value_is_not_kept(tmp_path):
     result, _, chosen = written(tmp_path, text, "y.radiance.value")
     assert [p.name for p in chosen] == ["x.bsdf.reflectance.value"] and result.xml is None
     assert "x.bsdf.reflectance.value is not in new.xml" in result.notes[0] and not any((tmp_path / "out").iterdir())
+
+
+def test_a_lone_value_that_mitsuba_does_not_read_leaves_no_file(tmp_path):
+    text = BSDFS["hair"] + '<shape type="sphere" id="s"><ref id="x"/></shape>'
+    result, _, _ = written(tmp_path, text, only="x.eumelanin")
+    assert result.xml is None and "x.eumelanin is not in new.xml: Mitsuba does not load" in result.notes[0]
+    assert not any((tmp_path / "out").iterdir())
