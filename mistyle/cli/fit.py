@@ -255,7 +255,7 @@ def _fit_scene(options: argparse.Namespace) -> int:
     else:
         for row in summary["values"]:
             print(f"{row['name']}: {row_text(row)}", file=sys.stderr)
-        for label in ("scene", "pictures", "report"):
+        for label in filter(summary.get, ("scene", "pictures", "report")):
             print(f"{label:<9} {summary[label]}", file=sys.stderr)
     progress.tell_notes()
     return 0

@@ -122,7 +122,7 @@ def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
     """The scene file with its defines resolved, for every renderer; `scene` itself without defines."""
     if not defines:
         return scene
-    from mistyle.render.live.source import resolved
+    from mistyle.io.scene_source import resolved
 
     if scene.suffix.lower() != ".xml":
         name, value = next(iter(defines.items()))

@@ -119,7 +119,7 @@ def _fit(
     progress.note(*fitted.notes, noise_text(fitted), *written[0].notes)
     summary = {
         "name": job.name,
-        "scene": str(job.out / "scene" / xml.name) if xml is not None else str(job.out / "scene"),
+        "scene": str(job.out / "scene" / xml.name) if xml is not None else None,
         "pictures": str(job.out / "pictures"),
         "report": str(job.out / "report" / "index.html"),
         "fitted": [p.name for p in fitted.parameters],

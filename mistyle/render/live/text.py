@@ -1,16 +1,26 @@
 """The text of a Mitsuba scene file: position and replacement of a parameter's element."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from mistyle.io.scene_source import Edit, Element, elements_of
 from mistyle.render.live.parameters import Parameter
-from mistyle.render.live.source import Edit, Element, elements_of
 from mistyle.render.mitsuba.device import mi
+
+# Plugins that read two indices of refraction; `mi.traverse` has their ratio `eta`.
+TWO_INDICES = {"dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic", "pplastic", "hair"}
+# A property whose default depends on another's, and the other: a file must hold both, or neither.
+PARTNERS = {("conductor", "eta"): "k", ("conductor", "k"): "eta", ("spot", "cutoff_angle"): "beam_width"}
+PARTNERS |= {("roughconductor", name): other for (plugin, name), other in PARTNERS.items() if plugin == "conductor"}
+# Names of children in `mi.traverse` and in the file, and of children that need no name there.
+READ_AS = {"interior_medium": "interior", "exterior_medium": "exterior"}
+KINDS = {"bsdf": "BSDF", "brdf": "BSDF", "nested_bsdf": "BSDF", "emitter": "Emitter", "phase": "PhaseFunction"}
+KINDS |= {"phase_function": "PhaseFunction", "normalmap": "Texture", "nested_texture": "Texture", "shape": "Shape"}
 
 
 def children(node: Any) -> list[tuple[str, int]]:
@@ -27,16 +37,12 @@ def _find(state: Any, p: Parameter) -> tuple[Any, str | None] | None:
         if head not in roots:
             continue
         node, left = state.nodes[roots[head]], parts
-        while left:
-            inner = _child(state, node, left[0])
-            if inner is None:
-                break
+        # A plugin that is a literal in other words (a d65 spectrum) is replaced as a whole.
+        while left and left[1:] != ["value"] and (inner := _child(state, node, left[0])) is not None:
             node, left = state.nodes[inner], left[1:]
-            if left == ["value"]:  # a literal that is spelt as a plugin
-                return None
         if left == ["data"]:
             return node, None
-        if len(left) == 1 or (len(left) == 2 and left[1] == "value"):
+        if left and set(left[1:]) <= {"value"}:
             return node, left[0]
     return None
 
@@ -45,62 +51,99 @@ def _child(state: Any, node: Any, name: str) -> int | None:
     """The child with the `mi.traverse` name `name`: by its name in the file, else the n-th material, the emitter, …"""
     held = children(node)
     for called, index in held:
-        if called == name:
+        if called == READ_AS.get(name, name):
             return index
     stem, number = re.fullmatch(r"(.*?)(?:_(\d+))?", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
-    kinds = {"bsdf": mi.ObjectType.BSDF, "brdf": mi.ObjectType.BSDF, "nested_bsdf": mi.ObjectType.BSDF}
-    kinds |= {"emitter": mi.ObjectType.Emitter, "normalmap": mi.ObjectType.Texture, "shape": mi.ObjectType.Shape}
-    fitting = [index for _, index in held if state.nodes[index].type == kinds.get(stem)]
+    fitting = [index for _, index in held if state.nodes[index].type.name == KINDS.get(stem)]
     place = int(number or 0)
     return fitting[place] if place < len(fitting) else None
 
 
 def edits_of(
-    state: Any, sources: Sequence[bytes], p: Parameter, values: np.ndarray, file: Path | None
+    state: Any, sources: Sequence[bytes], p: Parameter, values: Any, file: Path | None
 ) -> tuple[int, list[Edit]] | str:
     """The number of the file and its edits for one parameter, or the reason why it cannot be written.
 
-    `sources` are the texts of `state.files`: the scene's, then its includes.
+    `sources` are the texts of `state.files`: the scene's, then its includes. `values` is the scene's
+    `mi.traverse` table.
     """
     place = _find(state, p)
     if place is None:
         return "its element could not be distinguished from the others."
     node, literal = place
-    edits = _edits(node, literal, sources[node.file_index], p, values, file)
-    return edits if isinstance(edits, str) else (node.file_index, edits)
-
-
-def _edits(
-    node: Any, literal: str | None, source: bytes, p: Parameter, values: np.ndarray, file: Path | None
-) -> list[Edit] | str:
-    elements = elements_of(source)
+    elements = elements_of(sources[node.file_index])
     at = next((k for k, e in enumerate(elements) if e.begin == node.offset - 1), None)
     if at is None:
         return "its element could not be found in the text."
-    inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
     if literal is None:
-        if file is None or "filename" not in inner:
-            return "its texture has no file name that could be replaced."
-        old = inner["filename"]
-        edits = [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>')]
-        # An 8-bit or 16-bit format would round the file's values.
-        return edits + [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
-    if p.kind == "attribute":
-        return _mesh_edits(elements, at, file)
-    if p.kind != "value":
+        edits = _file_edits(elements, at, file)
+    elif p.kind == "attribute":
+        edits = _mesh_edits(elements, at, file)
+    elif p.kind != "value":
         return f"a scene file cannot store it; it was written as {file.name if file else 'nothing'}."
-    old = inner.get(literal)
-    numbers = " ".join(f"{float(v):.9g}" for v in values)
-    tag = "rgb" if len(values) == 3 else "float"
-    if len(values) not in (1, 3):
-        return f"it has {len(values)} numbers."
-    text = f"<{tag} name={quoteattr(literal)} value={quoteattr(numbers)}/>"
-    if old is not None:
-        return [(old.begin, old.end, text)]
-    element = elements[at]
-    if element.body != element.end:
-        return [(element.body, element.body, text)]
-    return [(element.end - 2, element.end, f">{text}</{element.tag}>")]
+    else:
+        edits = _literal_edits(elements, at, _properties(node, literal, p, values))
+    return edits if isinstance(edits, str) else (node.file_index, edits)
+
+
+def _properties(node: Any, literal: str, p: Parameter, values: Any) -> dict[str, np.ndarray | None]:
+    """The numbers of the properties that the plugin reads for a parameter; None: without the property."""
+    plugin, own = node.props.plugin_name(), np.array(values[p.key], np.float64).ravel()
+    if literal == "eta" and plugin in TWO_INDICES:
+        return {"int_ior": own * _outside(node.props["ext_ior"] if "ext_ior" in node.props else "air")}
+    result: dict[str, np.ndarray | None] = {literal: own}
+    partner = PARTNERS.get((plugin, literal))
+    if partner is not None and partner not in node.props:
+        stem, leaf = p.key.rsplit(f".{literal}", 1)
+        result[partner] = np.array(values[f"{stem}.{partner}{leaf}"], np.float64).ravel()
+    if partner is not None and "material" in node.props:
+        result["material"] = None
+    return result
+
+
+def _outside(index: float | str) -> float:
+    """An index of refraction, given as a number or as one of Mitsuba's names."""
+    glass: Any = mi.load_dict({"type": "dielectric", "int_ior": 1.0, "ext_ior": index})
+    return 1 / float(mi.traverse(glass)["eta"])
+
+
+def _file_edits(elements: Sequence[Element], at: int, file: Path | None) -> list[Edit] | str:
+    """The written file replaces a texture's."""
+    inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
+    if file is None or "filename" not in inner:
+        return "its texture has no file name that could be replaced."
+    old = inner["filename"]
+    # An 8-bit or 16-bit format would round the file's values.
+    dropped = [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
+    return [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>'), *dropped]
+
+
+def _literal_edits(
+    elements: Sequence[Element], at: int, properties: Mapping[str, np.ndarray | None]
+) -> list[Edit] | str:
+    """Set or remove properties of one element."""
+    element, inner = elements[at], {e.attributes.get("name"): e for e in elements if e.parent == at}
+    edits: list[Edit] = []
+    for name, numbers in properties.items():
+        old = inner.get(name)
+        if numbers is None:
+            edits += [(old.begin, old.end, "")] if old is not None else []
+            continue
+        tag = {1: "float", 3: "rgb"}.get(len(numbers))
+        if old is not None and old.tag == "string" and name == "values":  # of a tabulated phase function
+            tag = "string"
+        if tag is None or (old is not None and old.tag == "ref"):
+            return f"it has {len(numbers)} numbers." if tag is None else "another element also refers to its spectrum."
+        shown = quoteattr((", " if tag == "string" else " ").join(f"{v:.9g}" for v in numbers))
+        text = f"<{tag} name={quoteattr(name)} value={shown}/>"
+        if old is not None:
+            edits.append((old.begin, old.end, text))
+        elif element.body != element.end:
+            edits.append((element.body, element.body, text))
+        else:  # <bsdf/> becomes <bsdf>…</bsdf>
+            slash = (element.end - 2, element.end - 1, "")
+            edits += [slash, (element.end, element.end, text), (element.end, element.end, f"</{element.tag}>")]
+    return edits
 
 
 def _mesh_edits(elements: Sequence[Element], at: int, file: Path | None) -> list[Edit] | str:

@@ -15,8 +15,8 @@ import numpy as np
 from mistyle.core.errors import InputRefused
 from mistyle.core.names import WRITTEN, distinct, safe_name
 from mistyle.core.paths import real_path
+from mistyle.io import scene_source
 from mistyle.process import stopping
-from mistyle.render.live import source as scene_source
 from mistyle.render.live import text as scene_text
 from mistyle.render.live.parameters import Parameter
 from mistyle.render.mitsuba import device
@@ -142,8 +142,8 @@ def write_scene(
     The scene file is a copy of the loaded one. The fitted bitmaps' file names and the fitted literals' values are
     replaced, also in copies of included files. `<default>`s hold the values of the load, and a `<path>` leads to the
     folder of the original with its meshes and other files. A mesh with fitted attributes is written as PLY. The file
-    needs no mistyle. It is loaded once and its values are compared with the fitted ones; if they differ it is deleted,
-    and a note gives the reason. From a live `mi.Scene` only textures are written. `write_exr` is that of
+    needs no mistyle. It is loaded and its values are compared with the fitted ones; a parameter whose values differ
+    is left out, and a note gives the reason. From a live `mi.Scene` only textures are written. `write_exr` is that of
     `io/images/write.py`, `write_file` may be `atomic_write` of `io/store/atomic.py`.
     """
     out = Path(path)
@@ -157,26 +157,47 @@ def write_scene(
     if not isinstance(scene, SceneFile):
         return WrittenScene(None, textures, ("The scene does not come from a file: only its textures were written.",))
     sources = [Path(str(file)).read_bytes() for file in scene.state.files]
-    edits: dict[int, list[scene_source.Edit]] = {0: []}
-    notes = []
-    for p in fitted.parameters:
-        replaced = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
-        if isinstance(replaced, str):
-            notes.append(f"{p.name} is not in {out.name}: {replaced} run.json and the report have its value.")
-        else:
-            edits.setdefault(replaced[0], []).extend(replaced[1])
-    if not any(edits.values()):
-        return WrittenScene(None, textures, tuple(notes))
-    notes += _rewrite_includes(scene, sources, edits, out, write_file)
-    edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
-    write_file(out, scene_source.spliced(sources[0], edits[0]))
-    difference = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
-    if difference:
-        out.unlink()
-        return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {difference}"))
+    table, files = mi.traverse(live), dict[Path, bytes]()
+    found = {p: scene_text.edits_of(scene.state, sources, p, table, textures.get(p.key)) for p in fitted.parameters}
+    notes = {p: edits for p, edits in found.items() if isinstance(edits, str)}
+    included: list[str] = []
+
+    def attempt(chosen: Sequence[Parameter]) -> str:
+        """Write the scene file with the values of these parameters, if any; the first difference when it is loaded."""
+        for file in files:
+            file.unlink(missing_ok=True)
+        files.clear()
+        edits: dict[int, list[scene_source.Edit]] = {0: []}
+        for p in chosen:
+            edits.setdefault(found[p][0], []).extend(found[p][1])  # pyright: ignore[reportArgumentType]
+        included[:] = _rewrite_includes(scene, sources, edits, out, files.__setitem__)
+        edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
+        files[out] = scene_source.spliced(sources[0], edits[0])
+        for file, text in files.items() if chosen else ():
+            write_file(file, text)
+        return _differences(out, fitted, chosen) if chosen else ""
+
+    kept, wrong = _accepted(attempt, [p for p in fitted.parameters if p not in notes])
+    notes |= wrong
+    said = [f"{p.name} is not in {out.name}: {why} run.json and the report have its value." for p, why in notes.items()]
+    if not kept:
+        return WrittenScene(None, textures, tuple(said))
     if real_path(out.parent) != real_path(scene.path.parent):
-        notes.append(f"{out.name} reads its other files from {scene.path.parent}.")
-    return WrittenScene(out, textures, tuple(notes))
+        included.append(f"{out.name} reads its other files from {scene.path.parent}.")
+    return WrittenScene(out, textures, (*said, *included))
+
+
+def _accepted(
+    attempt: Callable[[Sequence[Parameter]], str], chosen: Sequence[Parameter]
+) -> tuple[Sequence[Parameter], dict[Parameter, str]]:
+    """The parameters whose values a scene file holds, all together or else those that it holds alone, and the
+    reasons against the others. The last attempt is that of the accepted ones."""
+    wrong: dict[Parameter, str] = {}
+    while why := attempt(chosen):
+        alone = {p: attempt([p]) for p in chosen} if len(chosen) > 1 and not wrong else dict.fromkeys(chosen, why)
+        bad = {p: reason for p, reason in alone.items() if reason} or dict.fromkeys(chosen, why)
+        wrong, chosen = wrong | bad, [p for p in chosen if p not in bad]
+    return chosen, wrong
 
 
 def _rewrite_includes(
@@ -232,20 +253,18 @@ def _without_seam(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values[:, 1:-1, :3])
 
 
-def _differences(out: Path, fitted: Any, left_out: set[str]) -> str:
+def _differences(out: Path, fitted: Any, chosen: Sequence[Parameter]) -> str:
     """Load the written file; the first difference, or an empty string."""
     try:
         loaded = load_scene_for_fit(out)
     except InputRefused as error:
-        return str(error)
+        return f"Mitsuba does not load the file with it ({' '.join(str(error).split())})."
     table = mi.traverse(loaded.scene)
-    for p in fitted.parameters:
-        if p.name in left_out:
-            continue
+    for p in chosen:
         if p.key not in table:
-            return f"it has no {p.key}."
+            return f"the file with it has no {p.key}."
         value, expected = np.array(table[p.key], dtype=np.float32).ravel(), fitted.values[p.key].ravel()
         # A light's single number comes back as a grey colour.
         if len(expected) not in (1, len(value)) or not np.allclose(value, expected, rtol=1e-6, atol=1e-7):
-            return f"it holds another {p.key}."
+            return "the file with it holds another value."
     return ""

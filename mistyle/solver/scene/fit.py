@@ -126,11 +126,16 @@ def _finished(
         # Unchanged values keep their bytes.
         state.values = {k: np.where(state.values[k] == state.start[k], state.start[k], v) for k, v in mean.items()}
     after = scene_result.looks(job, state.values, progress)
-    undone = scene_result.worse(job, before, after)
     errors, unconverged = scene_result.errors(job, state)
+    if state.newton is not None and (best := scene_newton.left_behind(job, state.newton, errors)) is not None:
+        values = scene_newton.spread(job, best, state.values)
+        earlier = scene_result.looks(job, values, lambda done: None)
+        if scene_result.worse(job, earlier, after):
+            state.values, after, unconverged = values, earlier, tuple(p.name for p in job.chosen)
+    undone = scene_result.worse(job, before, after)
     if undone:
         state.values, after = dict(state.start), list(before)
-        scene_grad.put(job.table, job.chosen, state.values)
+    scene_grad.put(job.table, job.chosen, state.values)
     rows = [
         Residual(k, (a.loss, b.loss), (a.psnr, b.psnr), (a.noise, b.noise))
         for k, (a, b) in enumerate(zip(before, after, strict=True))

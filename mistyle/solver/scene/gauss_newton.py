@@ -5,8 +5,9 @@ random numbers. It solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ 
 the expected I is R, so any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds with
 the J of others, so it has no bias from J's noise.
 
-The first rounds are short and approach the solution. The rest share the remaining steps and do not replace one another:
-the result is the mean of their solutions, and their disagreement its standard error.
+The first rounds are short and approach the solution. They share their random numbers, so that the difference of two
+noisy losses has little noise, and a step is kept only if the loss falls. The rest share the remaining steps and do not
+replace one another: the result is the mean of their solutions, and their disagreement its standard error.
 """
 
 import math
@@ -27,11 +28,13 @@ MOST_BYTES = 2.5e8  # largest size of the stored derivatives, also in checkpoint
 SPP = (8, 64)  # range of the derivatives' default samples, which cost about as much as the pictures
 OUTLIER, BESIDE = 8.0, 5  # limit of a derivative relative to its local mean size, and the window's side in pixels
 APPROACH = 0.6  # largest share of the steps in short rounds
-SHORT = 4  # least steps of a short round
+SHORT = 4  # pictures of each camera in a short round of one or two cameras
+SECANT = 0.03  # half the difference of roughness, over which its derivative is taken
 NEAR = 0.1  # relative change below which the long rounds begin
 LONG = (4, 8)  # fewest and most long rounds
 LOST = 0.01  # share of non-finite values above which a round returns half the way
 WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays unchanged
+FAR = 4.0  # standard errors between the short and the long rounds' results above which the two are compared
 DAMPING = 1e-3  # of the short rounds
 
 
@@ -76,10 +79,6 @@ class _PictureSums:
             return self.square
         return (self.total**2 - self.square) / (self.count * (self.count - 1))
 
-    def noise(self) -> float:
-        """The loss of the mean picture's noise alone."""
-        return float((self.weights * (self.total**2 / self.count**2 - self.products())).sum())
-
 
 def refusal(chosen: Sequence[Parameter], free: Mapping[str, np.ndarray], views: Sequence[Any], loss: Any) -> str:
     """The reason why Gauss–Newton does not suit a fit; empty if it does."""
@@ -114,7 +113,8 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
     """One round; False, without changes, on a request to stop. `camera` maps a step and a slot to a camera."""
     newton: Newton = state.newton
     size, long = _size(job, state)
-    turns = [[camera(state.iteration + m, slot) for slot in range(job.plan.sensors_per_step)] for m in range(size)]
+    begin = state.iteration if long else 0
+    turns = [[camera(begin + m, slot) for slot in range(job.plan.sensors_per_step)] for m in range(size)]
     views = tuple(sorted({k for turn in turns for k in turn}))
     # A short round needs both halves at its own values: H then has no bias from J's noise either.
     parts = [{k: _columns(job, state.values, newton, k, size, part) for k in views} for part in range(1 if long else 2)]
@@ -124,7 +124,7 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
     for m, turn in enumerate(turns):
         if stopping.asked():
             return False
-        numbers = [scene_grad.seeds(job.plan.seed, state.iteration + m, slot)[0] for slot in range(len(turn))]
+        numbers = [scene_grad.seeds(job.plan.seed, begin + m, slot)[0] for slot in range(len(turn))]
         renders = [_render_view(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
         losses.append(float(np.mean([value for value, _ in renders])))
         for k, (_, invalid) in zip(turn, renders, strict=True):
@@ -159,7 +159,7 @@ def _size(job: Any, state: Any) -> tuple[int, bool]:
     if state.newton.size:
         return min(state.newton.size, left), True
     all_views = math.ceil(len(job.views) / job.plan.sensors_per_step)
-    short = max(SHORT, all_views)
+    short = max(SHORT * min(all_views, 2), all_views)
     if not state.newton.near and state.iteration + short <= APPROACH * job.plan.iterations:
         return short, False
     cost = len(state.newton.theta) * len(job.views) / job.plan.sensors_per_step
@@ -168,18 +168,32 @@ def _size(job: Any, state: Any) -> tuple[int, bool]:
 
 
 def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) -> Float[np.ndarray, "n h w 3"]:
-    """The derivatives of camera k's picture at the values of the round, which has `size` steps."""
+    """The derivatives of camera k's picture at the values of the round, which has `size` steps.
+
+    That by a roughness is a difference of two pictures with the same random numbers: the derivative of a narrow lobe's
+    sampled density has so many outliers that what is left without them need not lead downhill.
+    """
     theta = newton.theta
     values, zero = spread(job, theta, fill), {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
     own = size * job.plan.spp * job.plan.sensors_per_step // (2 * len(theta) * len(job.views))
     spp = job.plan.spp_grad or min(max(own, SPP[0]), SPP[1])
     live = scene_grad.LiveScene(job.scene, job.table, job.chosen, job.engine)
+    rough = np.concatenate([np.full(int(job.free[p.key].sum()), p.role in scene_keys.ROUGH) for p in job.chosen])
     result = []
     for n in range(len(theta)):
         one = np.zeros(len(theta))
         one[n] = 1
         seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + 2 * newton.round + part, k, n)[0], job.views[k].sensor
-        result.append(scene_grad.derivative(live, values, spread(job, one, zero), sensor, spp, seed))
+        if not rough[n]:
+            result.append(scene_grad.derivative(live, values, spread(job, one, zero), sensor, spp, seed))
+            continue
+        ends = [np.clip(theta + step * one, *_bounds(job)) for step in (-SECANT, SECANT)]
+        pictures = []
+        for end in ends:
+            scene_grad.put(job.table, job.chosen, spread(job, end, fill))
+            pictures.append(np.array(scene_grad.picture(job.scene, job.engine, sensor, spp, seed))[..., :3])
+        slope = (pictures[1] - pictures[0]) / np.float32((ends[1] - ends[0])[n])
+        result.append(np.where(np.isfinite(slope), slope, np.float32(0)))
     return np.stack(result)
 
 
@@ -270,15 +284,13 @@ def _short_step(
 ) -> Float[np.ndarray, " n"]:
     """The values after a short round: a damped step, or half the way back to the best values so far.
 
-    It returns if the loss has increased, or if `lost`, the share of non-finite values, shows that the last step left
-    the plugins' domain.
+    It returns if the loss with the same random numbers has increased, or if `lost`, the share of non-finite values,
+    shows that the last step left the plugins' domain.
     """
     loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
-    noise = float(np.mean([s.noise() for s in seen.values()]))
-    if newton.best is not None and (lost > LOST or loss > newton.best[0] + noise):
+    if newton.best is not None and (lost > LOST or loss > newton.best[0]):
         return (newton.theta + newton.best[1]) / 2
-    if newton.best is None or loss < newton.best[0]:
-        newton.best = loss, newton.theta
+    newton.best = loss, newton.theta
     matrix: Any = np.mean(list(_matrices(job, newton, list(seen)).values()), axis=0)
     matrix = matrix + DAMPING * np.diag(np.abs(np.diag(matrix)))
     return _bounded(job, newton.theta, matrix, matrix @ newton.theta - gradient)
@@ -343,8 +355,9 @@ def _bounds(job: Any) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
-    """Standard error of every number (NaN if unconstrained), and whether its rounds still drift.
+def errors(job: Any, newton: Newton, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Standard error of every number (NaN if unconstrained), and whether it has not converged: its rounds still drift,
+    or it moved to where nothing constrains it.
 
     Render noise is estimated from the long rounds' disagreement, the references' noise from the residuals.
     """
@@ -362,7 +375,15 @@ def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
     half = len(used) // 2
     first, second = (_bounded(job, newton.theta, *_system(job, newton, part)) for part in (used[:half], used[half:]))
     drift = np.abs(second - first)
-    return error, (drift > 6 * np.nan_to_num(error)) & (drift > 0.02 * (np.abs(newton.theta) + 0.02 * _scales(job)))
+    drifts = (drift > 6 * np.nan_to_num(error)) & (drift > 0.02 * (np.abs(newton.theta) + 0.02 * _scales(job)))
+    return error, drifts | (np.isnan(error) & (newton.theta != start))
+
+
+def left_behind(job: Any, newton: Newton, errors: Mapping[str, np.ndarray]) -> Float[np.ndarray, " n"] | None:
+    """The best values of the short rounds if the long ones, which keep every step, ended outside their own errors."""
+    if newton.best is None or (np.abs(newton.best[1] - newton.theta) <= FAR * gathered(job, errors)).all():
+        return None
+    return newton.best[1]
 
 
 def saved(newton: Newton) -> dict[str, np.ndarray]:

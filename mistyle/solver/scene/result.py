@@ -133,7 +133,7 @@ def worse(job: SceneProblem, before: Sequence[ViewLook], after: Sequence[ViewLoo
 def errors(job: SceneProblem, state: FitState) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """Standard errors of `brief` by key, and the names of parameters that still drift."""
     if state.newton is not None:
-        error, drifts = scene_newton.errors(job, state.newton)
+        error, drifts = scene_newton.errors(job, state.newton, scene_newton.gathered(job, state.start))
         zero = {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
         by_key, moving = (scene_newton.spread(job, x.astype(float), zero) for x in (error, drifts))
         names = tuple(p.name for p in job.chosen if moving[p.key].any())

@@ -8,9 +8,9 @@ import pytest
 from mistyle.cli import main as cli
 from mistyle.core.errors import InputRefused, Stopped, UsageError
 from mistyle.fitting.pipeline.scene_references import choose_channels
+from mistyle.io import scene_source
 from mistyle.process import stopping
 from mistyle.render.live import parameters as scene_keys
-from mistyle.render.live import source as scene_source
 from mistyle.render.live import xml as scene_xml
 from mistyle.render.mitsuba import device
 from mistyle.solver.scene import fit as scene_fit

@@ -104,9 +104,9 @@ def _from(out: Path, folder: Path) -> str:
 
 
 def spliced(source: bytes, edits: Sequence[Edit]) -> bytes:
-    """The text with all edits applied."""
+    """The text with all edits applied, equal ones once; an end tag follows what is inserted at the same place."""
     result, at = [], 0
-    for begin, end, text in sorted(edits):
+    for begin, end, text in sorted(set(edits), key=lambda e: (e[0], e[1], e[2].startswith("</"), e[2])):
         result += [source[at:begin], text.encode()]
         at = end
     return b"".join([*result, source[at:]])
