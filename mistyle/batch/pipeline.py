@@ -7,6 +7,7 @@ OUT/batch.json, OUT/batch.html   the summary, machine-readable and as a page
 """
 
 import json
+import os
 import shlex
 import sys
 import time
@@ -17,8 +18,8 @@ from typing import Any
 
 from mistyle.batch import engines
 from mistyle.batch.jobs_file import Record, read_jobs
-from mistyle.batch.plan import PLAN, BatchPlan, read_plan, write_plan
-from mistyle.batch.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
+from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, read_plan, write_plan
+from mistyle.batch.shard import claim_batch, finished, job_of, marker, outcome
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.io.store.atomic import clean_leftovers
 from mistyle.io.store.keeper import Keeper
@@ -47,14 +48,23 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
     is_plan = jobs.name == PLAN or (jobs.is_dir() and (jobs / PLAN).is_file())
     if is_plan:
         plan = read_plan(jobs)
-        if out is not None and out.absolute() != plan.out:
+        if out is not None and os.path.realpath(out) != os.path.realpath(plan.out):
             raise UsageError(
                 f"{jobs}: this plan writes to {plan.out}; leave out -o, or write a new plan from the jobs file"
             )
+        check_moved(plan)
         return plan
     if out is None:
         raise UsageError(f"{jobs}: a new batch needs -o OUT, its output folder")
     return BatchPlan(out.absolute(), read_jobs(jobs, threads_each(choices)))
+
+
+def opening_notes(plan: BatchPlan) -> list[str]:
+    """The notes of a plan that are due before anything runs."""
+    notes = []
+    if plan.moved_from is not None:
+        notes.append(f"This batch was made in {plan.moved_from} and is in {plan.out} now; it continues there.")
+    return notes
 
 
 def workers_of(choices: Choices) -> int:
