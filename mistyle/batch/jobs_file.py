@@ -17,7 +17,8 @@
     styles = ["starry_night.jpg", "woodcut.jpg"]
     variants = [{ seed = 0 }, { seed = 1 }]
 
-A folder is a grid of the meshes and the pictures in it (or in its subfolders `meshes` and `styles`).
+A folder is a grid of the meshes and the pictures in it (or in its subfolders `meshes` and `styles`). Names of jobs that
+a file does not name: names.py.
 """
 
 import itertools
@@ -27,8 +28,8 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, Field
 
+from mistyle.batch.names import Before, Source, job_names
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
-from mistyle.core.names import ASSET, distinct, safe_name
 from mistyle.core.settings import FrozenModel
 from mistyle.io.read_mesh import MESHES
 from mistyle.jobs.inputs import input_files
@@ -88,24 +89,26 @@ class Record(FrozenModel):
     settings: dict[str, Any]
 
 
-def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
+def read_jobs(path: Path, threads: int, before: Before | None = None) -> tuple[Record, ...]:
     """Every job of a jobs file or a folder, checked before any job runs; one error lists all refused jobs.
 
-    `threads` is the default of each job's settings. Raises UsageError or InputRefused.
+    `threads` is the default of each job's settings. Jobs of the plan `before` keep their names. Raises UsageError or
+    InputRefused.
     """
     # Absolute, so that all paths below it are absolute and joining them again changes nothing.
     base = (path if path.is_dir() else path.parent).absolute()
     file = _folder_jobs(path) if path.is_dir() else _file_jobs(path)
-    jobs = [*file.job, *itertools.chain.from_iterable(_grid_jobs(grid, base, str(path)) for grid in file.grid)]
-    if not jobs:
+    listed = [(job, _source(job, base)) for job in file.job]
+    listed += itertools.chain.from_iterable(_grid_jobs(grid, base, str(path)) for grid in file.grid)
+    if not listed:
         raise UsageError(
             f"{path}: found no job; expected [[job]] or [[grid]] entries, or a folder of meshes and pictures"
         )
-    if len(jobs) > MOST_JOBS:
-        raise UsageError(f"{path}: found {len(jobs)} jobs; expected {MOST_JOBS} at most. Split the file.")
+    if len(listed) > MOST_JOBS:
+        raise UsageError(f"{path}: found {len(listed)} jobs; expected {MOST_JOBS} at most. Split the file.")
     records, refusals, code = [], [], UsageError
-    names = _names(jobs)
-    for job, name in zip(jobs, names, strict=True):
+    names = job_names([source for _, source in listed], base, before)
+    for (job, _), name in zip(listed, names, strict=True):
         try:
             records.append(_record(job, name, file, base, threads))
         except MistyleError as error:
@@ -114,7 +117,7 @@ def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
     if refusals:
         more = f"\n  and {len(refusals) - MOST_LISTED} more" if len(refusals) > MOST_LISTED else ""
         raise code(
-            f"{path}: {len(refusals)} of {len(jobs)} jobs cannot run; nothing was started\n  "
+            f"{path}: {len(refusals)} of {len(listed)} jobs cannot run; nothing was started\n  "
             + "\n  ".join(refusals[:MOST_LISTED])
             + more
         )
@@ -152,17 +155,27 @@ def _folder_jobs(folder: Path) -> JobsFile:
     return JobsFile(grid=[Grid(meshes=meshes, styles=styles)])
 
 
-def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
+def source_of(job: Record) -> Source:
+    """What a resolved job is named after."""
+    return Source(job.mesh, job.style if job.style is not None else (job.references or Path()) / "fit")
+
+
+def _source(job: BatchJob, base: Path, rest: tuple[str, ...] = ()) -> Source:
+    second = job.style if job.style is not None else (job.references or Path()) / "fit"
+    return Source(base / job.mesh, base / second, rest, job.name)
+
+
+def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[tuple[BatchJob, Source]]:
     """The jobs of a grid, meshes first."""
     meshes, styles = _expanded(grid.meshes, base, origin), _expanded(grid.styles, base, origin)
     result = []
     for mesh, style in itertools.product(meshes, styles):
         for preset in grid.presets or [None]:
             for k, variant in enumerate(grid.variants or [{}]):
-                parts = [mesh.stem, style.stem]
-                parts += [preset] if preset is not None and len(grid.presets) > 1 else []
-                parts += [f"v{k}"] if len(grid.variants) > 1 else []
-                result.append(BatchJob(mesh=mesh, style=style, preset=preset, settings=variant, name="_".join(parts)))
+                rest = (preset,) if preset is not None and len(grid.presets) > 1 else ()
+                rest += (f"v{k}",) if len(grid.variants) > 1 else ()
+                job = BatchJob(mesh=mesh, style=style, preset=preset, settings=variant)
+                result.append((job, _source(job, base, rest)))
     return result
 
 
@@ -184,16 +197,6 @@ def _expanded(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
         else:
             paths.append(base / pattern)
     return list(dict.fromkeys(paths))
-
-
-def _names(jobs: Sequence[BatchJob]) -> list[str]:
-    """Distinct names of the jobs, safe as names of folders; equal ones get -2, -3, …"""
-
-    def base(job: BatchJob) -> str:
-        second = job.style.stem if job.style is not None else "fit"
-        return safe_name(job.name or f"{job.mesh.stem}_{second}", filler="-")
-
-    return distinct([base(job) for job in jobs], limit=ASSET, joint="-")
 
 
 def _record(job: BatchJob, name: str, file: JobsFile, base: Path, threads: int) -> Record:

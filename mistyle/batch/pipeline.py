@@ -12,15 +12,16 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mistyle.batch import engines
-from mistyle.batch.jobs_file import Record, read_jobs
-from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, read_plan, write_plan
+from mistyle.batch.jobs_file import MOST_LISTED, Record, read_jobs, source_of
+from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, inputs_of, read_plan, write_plan
 from mistyle.batch.shard import claim_batch, finished, job_of, marker, outcome
-from mistyle.core.errors import MistyleError, UsageError
+from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.core.names import folded
 from mistyle.io.store.atomic import clean_leftovers
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.output import keep_folder, write_file
@@ -56,7 +57,43 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
         return plan
     if out is None:
         raise UsageError(f"{jobs}: a new batch needs -o OUT, its output folder")
-    return BatchPlan(out.absolute(), read_jobs(jobs, threads_each(choices)))
+    before = _plan_in(out)
+    plan = BatchPlan(out.absolute(), read_jobs(jobs, threads_each(choices), _names_of(before)))
+    return replace(plan, notes=tuple(_other_files(plan, before)))
+
+
+def _plan_in(out: Path) -> tuple[Record, ...]:
+    """The jobs of the plan that an output folder has; empty where it has none that can be read."""
+    try:
+        return read_plan(out / PLAN).jobs
+    except (InputRefused, UsageError):
+        return ()
+
+
+def _names_of(jobs: Sequence[Record]) -> dict[tuple[str, str], list[str]]:
+    """The names of a plan's jobs by their files, for `names.job_names`."""
+    result: dict[tuple[str, str], list[str]] = {}
+    for job in jobs:
+        result.setdefault(source_of(job).files(), []).append(job.name)
+    return result
+
+
+def _other_files(plan: BatchPlan, before: Sequence[Record]) -> list[str]:
+    """Notes on jobs whose folder has results of another mesh or style, by the plan that it was made with."""
+    known = {folded(job.name): job for job in before}
+    notes = []
+    for job in plan.jobs:
+        old = known.get(folded(job.name))
+        if old is None or source_of(old).files() == source_of(job).files() or not (plan.out / job.name).is_dir():
+            continue
+        if finished(plan, job) is None:  # else the files are the same, in another place
+            was, now = (" with ".join(map(str, inputs_of(record))) for record in (old, job))
+            notes.append(
+                f"{job.name}: its folder has results of {was}; this run replaces them and continues their versions "
+                f"with {now}. Name the job, or choose another -o, to keep both."
+            )
+    more = len(notes) - MOST_LISTED
+    return notes[:MOST_LISTED] + ([f"{more} more folders have results of other files."] if more > 0 else [])
 
 
 def opening_notes(plan: BatchPlan) -> list[str]:
@@ -64,7 +101,7 @@ def opening_notes(plan: BatchPlan) -> list[str]:
     notes = []
     if plan.moved_from is not None:
         notes.append(f"This batch was made in {plan.moved_from} and is in {plan.out} now; it continues there.")
-    return notes
+    return [*notes, *plan.notes]
 
 
 def workers_of(choices: Choices) -> int:
@@ -138,7 +175,7 @@ def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) 
     state, content = result.state, result.told
     if ended is not None and ended.code != 0:
         state = "failed" if ended.code not in (75, 130) else "open"
-    row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index}
+    row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index} | _files(job)
     if state == "done":
         row |= {k: content[k] for k in ("seconds", "peak_gb", "figures")} | {"notes": content.get("notes", [])}
     if state == "failed":
@@ -148,6 +185,12 @@ def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) 
         error = error or content.get("error") or f"the process ended with {code}"
         row |= {"exit_code": code, "error": error, "last_lines": engines.last_lines(plan, index)}
     return row
+
+
+def _files(job: Record) -> dict[str, str]:
+    """The paths of a job's files, for its row."""
+    kind = "style" if job.style is not None else "references"
+    return {"mesh": str(job.mesh), kind: str(job.style or job.references)}
 
 
 def describe(summary: dict[str, Any]) -> str:
@@ -177,7 +220,7 @@ def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
     rows = []
     for job in plan.jobs:
         done = finished(plan, job) is not None
-        row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done, "refused": None}
+        row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done, "refused": None} | _files(job)
         try:
             estimate = (plan_material if job.kind == "fit" else plan_style)(job_of(plan, job))
         except MistyleError as error:

@@ -30,14 +30,16 @@ MAX_PLAN_BYTES = 1 << 30  # some hundred thousand jobs
 class BatchPlan:
     """The jobs of a batch, and the parent of their run folders.
 
-    plan.json does not hold the last two: `overwrite` allows this call to replace files in it that are not mistyle's,
-    `moved_from` is the folder in which the plan was written, where that is another one.
+    plan.json does not hold the last three: `overwrite` allows this call to replace files in it that are not mistyle's,
+    `moved_from` is the folder in which the plan was written, where that is another one, and `notes` are due before
+    anything runs.
     """
 
     out: Path
     jobs: tuple[Record, ...]
     overwrite: bool = False
     moved_from: Path | None = None
+    notes: tuple[str, ...] = ()
 
 
 def write_plan(plan: BatchPlan) -> Path:
@@ -91,13 +93,17 @@ def _where_it_lies(plan: BatchPlan, here: Path) -> BatchPlan:
     def follow(text: str) -> str:
         plain = os.path.normpath(text) if os.path.isabs(text) else text  # may be spelled JOBS/../OUT/
         moved = replaced(plain, maps)
+        if moved == plain and os.path.isabs(plain) and not os.path.lexists(plain):
+            # The whole project may have moved: inputs then lie beside the batch as they did before.
+            beside = os.path.normpath(here / os.path.relpath(plain, old))
+            return beside if os.path.lexists(beside) else text
         return text if moved == plain else moved
 
     return BatchPlan(here, tuple(with_paths(job, follow) for job in plan.jobs), moved_from=old)
 
 
 def check_moved(plan: BatchPlan) -> None:
-    """InputRefused where a moved batch has lost inputs: those outside its folder do not follow it."""
+    """InputRefused where a moved batch has lost inputs: they lie neither where they were nor as they did beside it."""
     if plan.moved_from is None:
         return
     lost = list(dict.fromkeys(str(path) for job in plan.jobs for path in inputs_of(job) if not path.exists()))

@@ -68,3 +68,14 @@ def test_what_cannot_follow_is_refused_with_both_places(batch, props):
     with pytest.raises(InputRefused, match="3 of its inputs are not") as lost:
         planned(new, None, ONE)
     assert str(batch) in str(lost.value) and str(new) in str(lost.value)
+
+
+def test_a_project_that_moved_with_its_batch_keeps_its_jobs(props, tmp_path, monkeypatch):
+    stand_in(monkeypatch, NOT_RUN)
+    plan = planned(props, props / "out", ONE)
+    for index in range(len(plan.jobs)):
+        done_by_hand(plan, index)
+    write_plan(plan)
+    new = props.rename(tmp_path / "moved")
+    assert run_batch(planned(new / "out", None, ONE), ONE)["reused"] == 4
+    assert planned(new, new / "out", ONE).jobs == planned(new / "out", None, ONE).jobs
