@@ -17,8 +17,7 @@
     styles = ["starry_night.jpg", "woodcut.jpg"]
     variants = [{ seed = 0 }, { seed = 1 }]
 
-A folder is a grid of the meshes and the pictures in it (or in its subfolders `meshes` and `styles`). Names of jobs that
-a file does not name: names.py.
+A folder is a grid of the meshes and the pictures in it: folder_jobs.py. Names of jobs without `name`: names.py.
 """
 
 import itertools
@@ -28,6 +27,7 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, Field
 
+from mistyle.batch.folder_jobs import folder_jobs
 from mistyle.batch.names import Before, Source, job_names
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.settings import FrozenModel
@@ -35,7 +35,6 @@ from mistyle.io.read_mesh import MESHES
 from mistyle.jobs.inputs import input_files
 from mistyle.jobs.settings import merge, validate
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MOST_JOBS = 100_000
 MOST_LISTED = 20
 
@@ -90,14 +89,30 @@ class Record(FrozenModel):
 
 
 def read_jobs(path: Path, threads: int, before: Before | None = None) -> tuple[Record, ...]:
-    """Every job of a jobs file or a folder, checked before any job runs; one error lists all refused jobs.
+    """Every job of a jobs file or a folder; see `read_file` and `resolve`."""
+    return resolve(read_file(path)[0], path, threads, before)
+
+
+def read_file(path: Path) -> tuple[JobsFile, tuple[str, ...]]:
+    """A jobs file as it stands, or a folder as one, with sentences on what of the folder is left out.
+
+    Raises UsageError or InputRefused.
+    """
+    if not path.is_dir():
+        return _file_jobs(path), ()
+    found = folder_jobs(path)
+    meshes, styles = ([str(p.relative_to(path)) for p in paths] for paths in (found.meshes, found.styles))
+    return JobsFile(grid=[Grid(meshes=meshes, styles=styles)]), found.left_out
+
+
+def resolve(file: JobsFile, path: Path, threads: int, before: Before | None = None) -> tuple[Record, ...]:
+    """Every job of the jobs file or folder `path`, checked before any job runs; one error lists all refused jobs.
 
     `threads` is the default of each job's settings. Jobs of the plan `before` keep their names. Raises UsageError or
     InputRefused.
     """
     # Absolute, so that all paths below it are absolute and joining them again changes nothing.
     base = (path if path.is_dir() else path.parent).absolute()
-    file = _folder_jobs(path) if path.is_dir() else _file_jobs(path)
     listed = [(job, _source(job, base)) for job in file.job]
     listed += itertools.chain.from_iterable(_grid_jobs(grid, base, str(path)) for grid in file.grid)
     if not listed:
@@ -139,20 +154,6 @@ def _file_jobs(path: Path) -> JobsFile:
         if isinstance(values.get(key), dict):  # [grid] for [[grid]]
             values[key] = [values[key]]
     return validate(values, str(path), JobsFile)
-
-
-def _folder_jobs(folder: Path) -> JobsFile:
-    def inside(name: str, kinds: Sequence[str]) -> list[str]:
-        place = folder / name if (folder / name).is_dir() else folder
-        return sorted(str(p.relative_to(folder)) for p in place.iterdir() if p.suffix.lower() in kinds and p.is_file())
-
-    meshes, styles = inside("meshes", tuple(MESHES)), inside("styles", PICTURES)
-    if not meshes or not styles:
-        raise InputRefused(
-            f"{folder}: found {len(meshes)} meshes and {len(styles)} pictures; expected at least one of each, in it or "
-            "in its subfolders meshes/ and styles/"
-        )
-    return JobsFile(grid=[Grid(meshes=meshes, styles=styles)])
 
 
 def source_of(job: Record) -> Source:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.batch import engines
-from mistyle.batch.jobs_file import MOST_LISTED, Record, read_jobs, source_of
+from mistyle.batch.jobs_file import MOST_LISTED, Record, read_file, resolve, source_of
 from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, inputs_of, read_plan, write_plan
 from mistyle.batch.shard import claim_batch, finished, job_of, marker, outcome
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
@@ -58,7 +58,8 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
     if out is None:
         raise UsageError(f"{jobs}: a new batch needs -o OUT, its output folder")
     before = _plan_in(out)
-    plan = BatchPlan(out.absolute(), read_jobs(jobs, threads_each(choices), _names_of(before)))
+    file, left_out = read_file(jobs)
+    plan = BatchPlan(out.absolute(), resolve(file, jobs, threads_each(choices), _names_of(before)), left_out)
     return replace(plan, notes=tuple(_other_files(plan, before)))
 
 
@@ -101,7 +102,7 @@ def opening_notes(plan: BatchPlan) -> list[str]:
     notes = []
     if plan.moved_from is not None:
         notes.append(f"This batch was made in {plan.moved_from} and is in {plan.out} now; it continues there.")
-    return [*notes, *plan.notes]
+    return [*notes, *plan.left_out, *plan.notes]
 
 
 def workers_of(choices: Choices) -> int:
@@ -166,6 +167,7 @@ def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, 
         "reused": reused,
         "seconds": round(seconds, 2),
         "retry": shlex.join(retry) if failed else None,
+        "left_out": list(plan.left_out),
         "rows": rows,
     }
 
@@ -231,6 +233,7 @@ def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
     workers = min(workers_of(choices), max(len(remaining), 1))
     return {
         "out": str(plan.out),
+        "left_out": list(plan.left_out),
         "jobs": rows,
         "workers": workers,
         "seconds": round(sum(row["seconds"] for row in remaining) / workers),

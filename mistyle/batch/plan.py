@@ -30,13 +30,15 @@ MAX_PLAN_BYTES = 1 << 30  # some hundred thousand jobs
 class BatchPlan:
     """The jobs of a batch, and the parent of their run folders.
 
-    plan.json does not hold the last three: `overwrite` allows this call to replace files in it that are not mistyle's,
+    `left_out` are sentences on files of a folder that take no part. plan.json does not hold the last three: `overwrite`
+    allows this call to replace files in it that are not mistyle's,
     `moved_from` is the folder in which the plan was written, where that is another one, and `notes` are due before
     anything runs.
     """
 
     out: Path
     jobs: tuple[Record, ...]
+    left_out: tuple[str, ...] = ()
     overwrite: bool = False
     moved_from: Path | None = None
     notes: tuple[str, ...] = ()
@@ -49,7 +51,7 @@ def write_plan(plan: BatchPlan) -> Path:
         "mistyle": __version__,
         "out": str(plan.out.absolute()),
         "jobs": [job.model_dump(mode="json") for job in plan.jobs],
-    }
+    } | ({"left_out": plan.left_out} if plan.left_out else {})
     write_file(plan.out, PLAN, (json.dumps(values, indent=1, sort_keys=True) + "\n").encode(), overwrite=plan.overwrite)
     return plan.out / PLAN
 
@@ -70,7 +72,8 @@ def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> BatchPlan:
         raise InputRefused(f"{path}: found no plan of version {VERSION}; write it again with `mistyle batch`")
     jobs = tuple(mapped(validate(job, str(path), Record), maps) for job in values["jobs"])
     out = replaced(str(values["out"]), maps)
-    plan = BatchPlan(Path(out), jobs)
+    left_out = values.get("left_out")
+    plan = BatchPlan(Path(out), jobs, tuple(map(str, left_out)) if isinstance(left_out, list) else ())
     return plan if out != str(values["out"]) else _where_it_lies(plan, path.parent.absolute())
 
 
@@ -99,7 +102,7 @@ def _where_it_lies(plan: BatchPlan, here: Path) -> BatchPlan:
             return beside if os.path.lexists(beside) else text
         return text if moved == plain else moved
 
-    return BatchPlan(here, tuple(with_paths(job, follow) for job in plan.jobs), moved_from=old)
+    return replace(plan, out=here, jobs=tuple(with_paths(job, follow) for job in plan.jobs), moved_from=old)
 
 
 def check_moved(plan: BatchPlan) -> None:
