@@ -28,8 +28,9 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel, Field
 
 from mistyle.batch.folder_jobs import folder_jobs
-from mistyle.batch.names import Before, Source, job_names
+from mistyle.batch.names import Before, Source, job_names, why_not
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.core.names import folded
 from mistyle.core.settings import FrozenModel
 from mistyle.io.read_mesh import MESHES
 from mistyle.jobs.inputs import input_files
@@ -123,8 +124,11 @@ def resolve(file: JobsFile, path: Path, threads: int, before: Before | None = No
         raise UsageError(f"{path}: found {len(listed)} jobs; expected {MOST_JOBS} at most. Split the file.")
     records, refusals, code = [], [], UsageError
     names = job_names([source for _, source in listed], base, before)
+    known = {folded(name) for name in names}
     for (job, _), name in zip(listed, names, strict=True):
         try:
+            if reason := why_not(name, known):
+                raise UsageError(reason)
             records.append(_record(job, name, file, base, threads))
         except MistyleError as error:
             refusals.append(f"{name}: {error}")

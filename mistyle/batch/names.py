@@ -9,12 +9,13 @@ import hashlib
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mistyle.core.names import ASSET, FILE_NAME, cut, distinct, folded, safe_name
 
+OWN = ("batch.html", "batch.json", "farm", "plan.json", "shards")  # what a batch itself writes beside its jobs
 DIGEST = 6  # hexadecimal digits of a name that nothing else tells apart
 
 
@@ -70,6 +71,16 @@ def job_names(sources: Sequence[Source], base: Path, before: Before | None = Non
             digest = hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:DIGEST]
             names[k] = f"{cut(names[k], ASSET - DIGEST - 1)}-{digest}"
     return distinct(names, limit=ASSET, joint="-")
+
+
+def why_not(name: str, others: Collection[str]) -> str:
+    """Why a job of a batch cannot have this name; "" where it can. `others` are the batch's names, `folded`."""
+    if folded(name) in OWN:
+        return f"'{name}' is the name of a file or folder that the batch itself writes. Choose another name"
+    stem = folded(name).removesuffix(".failed")
+    if stem != folded(name) and stem in others:  # shards/<name>.failed.json is the mark of a failure
+        return f"'{name}' is how the batch marks a failure of its job '{name[: len(stem)]}'. Choose another name"
+    return ""
 
 
 def _to_be_marked(group: Sequence[int], sources: Sequence[Source], rank: Sequence[int]) -> list[int]:

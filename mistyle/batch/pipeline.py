@@ -18,7 +18,7 @@ from typing import Any
 
 from mistyle.batch import engines
 from mistyle.batch.jobs_file import MOST_LISTED, Record, read_file, resolve, source_of
-from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, inputs_of, read_plan, write_plan
+from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, check_names, inputs_of, read_plan, write_plan
 from mistyle.batch.shard import claim_batch, finished, job_of, marker, outcome
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.names import folded
@@ -53,6 +53,7 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
             raise UsageError(
                 f"{jobs}: this plan writes to {plan.out}; leave out -o, or write a new plan from the jobs file"
             )
+        check_names(plan)
         check_moved(plan)
         return plan
     if out is None:
@@ -157,7 +158,6 @@ def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, 
     """The summary: the state of every job of the plan, and the command that retries the failed ones."""
     rows = [_row(plan, k, job, ended.get(k)) for k, job in enumerate(plan.jobs)]
     failed = [row["name"] for row in rows if row["state"] == "failed"]
-    retry = ["mistyle", "batch", str(plan.out / PLAN), *(["--only", *failed] if failed else [])]
     return {
         "out": str(plan.out),
         "jobs": len(rows),
@@ -166,10 +166,17 @@ def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, 
         "open": sum(row["state"] == "open" for row in rows),
         "reused": reused,
         "seconds": round(seconds, 2),
-        "retry": shlex.join(retry) if failed else None,
+        "retry": retry_command(plan, failed) if failed else None,
         "left_out": list(plan.left_out),
         "rows": rows,
     }
+
+
+def retry_command(plan: BatchPlan, names: Sequence[str]) -> str:
+    """The shell command that runs these jobs again. Names that begin with a dash would be read as options."""
+    plain = [name for name in names if not name.startswith("-")]
+    only = [*(["--only", *plain] if plain else []), *(f"--only={name}" for name in names if name.startswith("-"))]
+    return shlex.join(["mistyle", "batch", str(plan.out / PLAN), *only])
 
 
 def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) -> dict[str, Any]:

@@ -15,7 +15,9 @@ from typing import Any
 
 from mistyle import __version__
 from mistyle.batch.jobs_file import Record
+from mistyle.batch.names import why_not
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.names import folded
 from mistyle.io.store.output import write_file
 from mistyle.io.store.trusted_json import read_own
 from mistyle.jobs.settings import merge, validate
@@ -103,6 +105,14 @@ def _where_it_lies(plan: BatchPlan, here: Path) -> BatchPlan:
         return text if moved == plain else moved
 
     return replace(plan, out=here, jobs=tuple(with_paths(job, follow) for job in plan.jobs), moved_from=old)
+
+
+def check_names(plan: BatchPlan) -> None:
+    """UsageError where a job of an older or edited plan has the name of one of the batch's own files."""
+    known = {folded(job.name) for job in plan.jobs}
+    for job in plan.jobs:
+        if reason := why_not(job.name, known):
+            raise UsageError(f"{plan.out / PLAN}: {reason} in the jobs file, and write the plan anew from it")
 
 
 def check_moved(plan: BatchPlan) -> None:

@@ -54,7 +54,14 @@ def _add_batch(verbs: Any) -> None:
         "--wait", type=float, default=300.0, metavar="S", help="Ray: seconds without a started job before giving up"
     )
     verb.add_argument("--timeout", type=float, metavar="S", help="stop a job that takes longer")
-    verb.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these jobs of the plan")
+    verb.add_argument(
+        "--only",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="only these jobs of the plan; --only=-b where a name begins with a dash",
+    )
     verb.add_argument("--watch", action="store_true", help="a live table instead of a line per job")
     verb.add_argument("--dry-run", action="store_true", help="print the plan with time, disk and memory, and stop")
     add_overwrite_option(verb)

@@ -2,15 +2,19 @@
 
 import json
 import shutil
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from batch_parts import CUBE, done_by_hand, jobs_file, stand_in
 
-from mistyle.batch.names import Source, job_names
+from mistyle.batch.names import OWN, Source, job_names
 from mistyle.batch.page import write_page
 from mistyle.batch.pipeline import Choices, dry_run, opening_notes, planned, run_batch
-from mistyle.batch.plan import write_plan
+from mistyle.batch.plan import PLAN, SHARDS, write_plan
+from mistyle.cli.main import main
+from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, is_safe
 
 ONE = Choices(threads=1)
@@ -83,6 +87,46 @@ def test_names_of_the_plan_before_stay():
     assert named("bench/model.obj", before={files("bench/model.obj"): ["hero", "model_style_v1"]}) == ["model_style"]
 
 
+@pytest.mark.parametrize("name", ["batch.html", "PLAN.json", "batch.json", "shards", "farm", "Shards ", "a.failed"])
+def test_names_of_the_batchs_own_files_are_refused_before_anything(props, tmp_path, name, capsys):
+    text = "".join(f'[[job]]\nmesh = "meshes/cube.obj"\nstyle = "styles/wave.png"\nname = "{n}"\n' for n in ("a", name))
+    jobs = str(jobs_file(props, text))
+    for rest in (["--dry-run"], []):
+        assert main(["batch", jobs, "-o", str(tmp_path / "out"), *rest]) == 2
+        assert "1 of 2 jobs cannot run" in (said := capsys.readouterr().err) and "Choose another name" in said
+    assert not (tmp_path / "out").exists()
+    # A plan of an older version may have such a name.
+    plan = planned(jobs_file(props, text.replace(f'"{name}"', '"b"')), tmp_path / "out", ONE)
+    write_plan(replace(plan, jobs=(plan.jobs[0], plan.jobs[1].model_copy(update={"name": name.strip()}))))
+    with pytest.raises(UsageError, match="Choose another name in the jobs file"):
+        planned(tmp_path / "out", None, ONE)
+
+
+def test_names_that_only_look_like_the_batchs_own_are_taken(props, tmp_path):
+    assert set(OWN) >= {PLAN, SHARDS}
+    text = '[[job]]\nmesh = "meshes/cube.obj"\nstyle = "styles/wave.png"\nname = "{}"\n'
+    names = ["plan", "batch", "shards_2", "b.failed"]
+    jobs = jobs_file(props, "".join(map(text.format, names)))
+    assert [job.name for job in planned(jobs, tmp_path / "out", ONE).jobs] == names
+
+
+def test_the_printed_retry_works_in_a_shell(props, tmp_path, monkeypatch, capsys):
+    text = '[[job]]\nmesh = "meshes/cube.obj"\nstyle = "styles/wave.png"\nname = "{}"\n'
+    jobs = jobs_file(props, "".join(map(text.format, ["-b", "a", "木", "--json", "done"])))
+    plan = planned(jobs, tmp_path / "out of it's", ONE)
+    write_plan(plan)
+    stand_in(monkeypatch, "import sys; sys.exit(0 if sys.argv[1] == '4' else 9)")
+    retry = run_batch(plan, ONE)["retry"]
+    shell = subprocess.run(
+        ["sh", "-c", f'mistyle() {{ printf "%s\\n" "$@"; }}; {retry}'], capture_output=True, text=True
+    )
+    words = shell.stdout.splitlines()
+    assert words == ["batch", str(plan.out / PLAN), "--only", "a", "木", "--only=-b", "--only=--json"]
+    assert main([*words, "--threads", "1", "--json"]) == 1
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [row["state"] for row in rows] == ["failed"] * 4 + ["open"]
+
+
 @pytest.fixture
 def assets(props) -> Path:
     """A jobs file of meshes that are all called model.obj; two there, bench and chair."""
@@ -117,8 +161,6 @@ def test_a_mesh_keeps_its_folder_when_others_come_and_go(assets, tmp_path):
 
 
 def test_a_folder_of_another_mesh_is_noted_before_anything_runs(props, tmp_path, capsys):
-    from mistyle.cli.main import main
-
     def listed(mesh: str) -> Path:
         return jobs_file(props, f'[[job]]\nmesh = "meshes/{mesh}.obj"\nstyle = "styles/wave.png"\nname = "hero"\n')
 
