@@ -21,6 +21,7 @@ A folder is a grid of the meshes and the pictures in it: folder_jobs.py. Names o
 """
 
 import itertools
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -187,7 +188,8 @@ def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[tuple[BatchJob, Sour
 def _expanded(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
     paths: list[Path] = []
     for pattern in patterns:
-        if any(c in pattern for c in "*?["):
+        # A file may have brackets in its name: what exists is that file.
+        if any(c in pattern for c in "*?[") and not os.path.isfile(base / pattern):
             place = Path(pattern)
             root, inner = (
                 (Path(place.anchor), place.relative_to(place.anchor)) if place.is_absolute() else (base, place)

@@ -118,6 +118,19 @@ def test_a_list_a_grid_and_what_holds_for_all(props):
     assert records[3].settings["rig"]["resolution"] == 1024
 
 
+def test_a_file_with_brackets_in_its_name_is_that_file(props, tmp_path):
+    (props / "meshes" / "[v2] cube.obj").write_text(CUBE)
+    (props / "styles" / "wave?*.png").write_bytes((props / "styles" / "wave.png").read_bytes())
+    text = '[[grid]]\nmeshes = ["meshes/[v2] cube.obj", "meshes/[b]*.obj"]\nstyles = ["styles/wave?*.png"]\n'
+    records = read_jobs(jobs_file(props, text), 1)
+    assert [record.mesh.name for record in records] == ["[v2] cube.obj", "box.obj"]
+    assert all(record.style is not None and record.style.name == "wave?*.png" for record in records)
+    # A folder names its own files.
+    assert {record.mesh.name for record in read_jobs(props, 1)} == {"[v2] cube.obj", "box.obj", "cube.obj"}
+    with pytest.raises(InputRefused, match="matches no file"):
+        read_jobs(jobs_file(props, text.replace("[v2]", "[v3]")), 1)
+
+
 def test_yaml_says_the_same(props):
     toml = jobs_file(props, '[grid]\nmeshes = ["meshes/cube.obj"]\nstyles = ["styles/ink.jpg", "styles/wave.png"]\n')
     yaml = jobs_file(
