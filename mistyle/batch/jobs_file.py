@@ -17,24 +17,26 @@
     styles = ["starry_night.jpg", "woodcut.jpg"]
     variants = [{ seed = 0 }, { seed = 1 }]
 
-A folder is a grid of the meshes and the pictures in it (or in its subfolders `meshes` and `styles`).
+A folder is a grid of the meshes and the pictures in it: folder_jobs.py. Names of jobs without `name`: names.py.
 """
 
 import itertools
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, Field
 
+from mistyle.batch.folder_jobs import folder_jobs
+from mistyle.batch.names import Before, Source, job_names, why_not
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
-from mistyle.core.names import ASSET, distinct, safe_name
+from mistyle.core.names import folded
 from mistyle.core.settings import FrozenModel
 from mistyle.io.read_mesh import MESHES
 from mistyle.jobs.inputs import input_files
 from mistyle.jobs.settings import merge, validate
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MOST_JOBS = 100_000
 MOST_LISTED = 20
 
@@ -88,25 +90,46 @@ class Record(FrozenModel):
     settings: dict[str, Any]
 
 
-def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
-    """Every job of a jobs file or a folder, checked before any job runs; one error lists all refused jobs.
+def read_jobs(path: Path, threads: int, before: Before | None = None) -> tuple[Record, ...]:
+    """Every job of a jobs file or a folder; see `read_file` and `resolve`."""
+    return resolve(read_file(path)[0], path, threads, before)
 
-    `threads` is the default of each job's settings. Raises UsageError or InputRefused.
+
+def read_file(path: Path) -> tuple[JobsFile, tuple[str, ...]]:
+    """A jobs file as it stands, or a folder as one, with sentences on what of the folder is left out.
+
+    Raises UsageError or InputRefused.
+    """
+    if not path.is_dir():
+        return _file_jobs(path), ()
+    found = folder_jobs(path)
+    meshes, styles = ([str(p.relative_to(path)) for p in paths] for paths in (found.meshes, found.styles))
+    return JobsFile(grid=[Grid(meshes=meshes, styles=styles)]), found.left_out
+
+
+def resolve(file: JobsFile, path: Path, threads: int, before: Before | None = None) -> tuple[Record, ...]:
+    """Every job of the jobs file or folder `path`, checked before any job runs; one error lists all refused jobs.
+
+    `threads` is the default of each job's settings. Jobs of the plan `before` keep their names. Raises UsageError or
+    InputRefused.
     """
     # Absolute, so that all paths below it are absolute and joining them again changes nothing.
     base = (path if path.is_dir() else path.parent).absolute()
-    file = _folder_jobs(path) if path.is_dir() else _file_jobs(path)
-    jobs = [*file.job, *itertools.chain.from_iterable(_grid_jobs(grid, base, str(path)) for grid in file.grid)]
-    if not jobs:
+    listed = [(job, _source(job, base)) for job in file.job]
+    listed += itertools.chain.from_iterable(_grid_jobs(grid, base, str(path)) for grid in file.grid)
+    if not listed:
         raise UsageError(
             f"{path}: found no job; expected [[job]] or [[grid]] entries, or a folder of meshes and pictures"
         )
-    if len(jobs) > MOST_JOBS:
-        raise UsageError(f"{path}: found {len(jobs)} jobs; expected {MOST_JOBS} at most. Split the file.")
+    if len(listed) > MOST_JOBS:
+        raise UsageError(f"{path}: found {len(listed)} jobs; expected {MOST_JOBS} at most. Split the file.")
     records, refusals, code = [], [], UsageError
-    names = _names(jobs)
-    for job, name in zip(jobs, names, strict=True):
+    names = job_names([source for _, source in listed], base, before)
+    known = {folded(name) for name in names}
+    for (job, _), name in zip(listed, names, strict=True):
         try:
+            if reason := why_not(name, known):
+                raise UsageError(reason)
             records.append(_record(job, name, file, base, threads))
         except MistyleError as error:
             refusals.append(f"{name}: {error}")
@@ -114,7 +137,7 @@ def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
     if refusals:
         more = f"\n  and {len(refusals) - MOST_LISTED} more" if len(refusals) > MOST_LISTED else ""
         raise code(
-            f"{path}: {len(refusals)} of {len(jobs)} jobs cannot run; nothing was started\n  "
+            f"{path}: {len(refusals)} of {len(listed)} jobs cannot run; nothing was started\n  "
             + "\n  ".join(refusals[:MOST_LISTED])
             + more
         )
@@ -138,38 +161,35 @@ def _file_jobs(path: Path) -> JobsFile:
     return validate(values, str(path), JobsFile)
 
 
-def _folder_jobs(folder: Path) -> JobsFile:
-    def inside(name: str, kinds: Sequence[str]) -> list[str]:
-        place = folder / name if (folder / name).is_dir() else folder
-        return sorted(str(p.relative_to(folder)) for p in place.iterdir() if p.suffix.lower() in kinds and p.is_file())
-
-    meshes, styles = inside("meshes", tuple(MESHES)), inside("styles", PICTURES)
-    if not meshes or not styles:
-        raise InputRefused(
-            f"{folder}: found {len(meshes)} meshes and {len(styles)} pictures; expected at least one of each, in it or "
-            "in its subfolders meshes/ and styles/"
-        )
-    return JobsFile(grid=[Grid(meshes=meshes, styles=styles)])
+def source_of(job: Record) -> Source:
+    """What a resolved job is named after."""
+    return Source(job.mesh, job.style if job.style is not None else (job.references or Path()) / "fit")
 
 
-def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
+def _source(job: BatchJob, base: Path, rest: tuple[str, ...] = ()) -> Source:
+    second = job.style if job.style is not None else (job.references or Path()) / "fit"
+    return Source(base / job.mesh, base / second, rest, job.name)
+
+
+def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[tuple[BatchJob, Source]]:
     """The jobs of a grid, meshes first."""
     meshes, styles = _expanded(grid.meshes, base, origin), _expanded(grid.styles, base, origin)
     result = []
     for mesh, style in itertools.product(meshes, styles):
         for preset in grid.presets or [None]:
             for k, variant in enumerate(grid.variants or [{}]):
-                parts = [mesh.stem, style.stem]
-                parts += [preset] if preset is not None and len(grid.presets) > 1 else []
-                parts += [f"v{k}"] if len(grid.variants) > 1 else []
-                result.append(BatchJob(mesh=mesh, style=style, preset=preset, settings=variant, name="_".join(parts)))
+                rest = (preset,) if preset is not None and len(grid.presets) > 1 else ()
+                rest += (f"v{k}",) if len(grid.variants) > 1 else ()
+                job = BatchJob(mesh=mesh, style=style, preset=preset, settings=variant)
+                result.append((job, _source(job, base, rest)))
     return result
 
 
 def _expanded(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
     paths: list[Path] = []
     for pattern in patterns:
-        if any(c in pattern for c in "*?["):
+        # A file may have brackets in its name: what exists is that file.
+        if any(c in pattern for c in "*?[") and not os.path.isfile(base / pattern):
             place = Path(pattern)
             root, inner = (
                 (Path(place.anchor), place.relative_to(place.anchor)) if place.is_absolute() else (base, place)
@@ -184,16 +204,6 @@ def _expanded(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
         else:
             paths.append(base / pattern)
     return list(dict.fromkeys(paths))
-
-
-def _names(jobs: Sequence[BatchJob]) -> list[str]:
-    """Distinct names of the jobs, safe as names of folders; equal ones get -2, -3, …"""
-
-    def base(job: BatchJob) -> str:
-        second = job.style.stem if job.style is not None else "fit"
-        return safe_name(job.name or f"{job.mesh.stem}_{second}", filler="-")
-
-    return distinct([base(job) for job in jobs], limit=ASSET, joint="-")
 
 
 def _record(job: BatchJob, name: str, file: JobsFile, base: Path, threads: int) -> Record:

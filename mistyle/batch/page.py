@@ -18,7 +18,7 @@ body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:1500px;paddin
 h1{font-size:1.4rem}.sheet{display:grid;grid-template-columns:repeat(auto-fill,minmax(230px,1fr));gap:1rem}
 figure{margin:0;border:1px solid var(--line);border-radius:6px;overflow:hidden}
 figure img,figure .none{width:100%;aspect-ratio:1;object-fit:contain;display:block;background:#8881}
-figcaption{padding:.5rem .7rem;overflow-wrap:anywhere}.failed figcaption b{color:#d33}
+figcaption{padding:.5rem .7rem;overflow-wrap:anywhere}figcaption small{opacity:.75}.failed figcaption b{color:#d33}
 .wide{overflow-x:auto}table{border-collapse:collapse;width:100%;margin:2rem 0;font-variant-numeric:tabular-nums}
 th,td{border-bottom:1px solid var(--line);padding:.35rem .6rem;text-align:right}
 th:first-child,td:first-child,td.text{text-align:left}th button{all:unset;cursor:pointer}
@@ -67,6 +67,8 @@ def _row(plan: BatchPlan, row: dict[str, Any]) -> dict[str, Any]:
     return {
         "name": row["name"],
         "state": row["state"],
+        "mesh": row["mesh"],
+        "second": row.get("style") or row.get("references", ""),
         "error": row.get("error", ""),
         "last_lines": row.get("last_lines", ""),
         "report": f"{row['name']}/report/index.html" if report.is_file() else "",

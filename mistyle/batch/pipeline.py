@@ -7,19 +7,21 @@ OUT/batch.json, OUT/batch.html   the summary, machine-readable and as a page
 """
 
 import json
+import os
 import shlex
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from mistyle.batch import engines
-from mistyle.batch.jobs_file import Record, read_jobs
-from mistyle.batch.plan import PLAN, BatchPlan, read_plan, write_plan
-from mistyle.batch.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
-from mistyle.core.errors import MistyleError, UsageError
+from mistyle.batch.jobs_file import MOST_LISTED, Record, read_file, resolve, source_of
+from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, check_names, inputs_of, read_plan, write_plan
+from mistyle.batch.shard import claim_batch, finished, job_of, marker, outcome
+from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.core.names import folded
 from mistyle.io.store.atomic import clean_leftovers
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.output import keep_folder, write_file
@@ -47,14 +49,61 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
     is_plan = jobs.name == PLAN or (jobs.is_dir() and (jobs / PLAN).is_file())
     if is_plan:
         plan = read_plan(jobs)
-        if out is not None and out.absolute() != plan.out:
+        if out is not None and os.path.realpath(out) != os.path.realpath(plan.out):
             raise UsageError(
                 f"{jobs}: this plan writes to {plan.out}; leave out -o, or write a new plan from the jobs file"
             )
+        check_names(plan)
+        check_moved(plan)
         return plan
     if out is None:
         raise UsageError(f"{jobs}: a new batch needs -o OUT, its output folder")
-    return BatchPlan(out.absolute(), read_jobs(jobs, threads_each(choices)))
+    before = _plan_in(out)
+    file, left_out = read_file(jobs)
+    plan = BatchPlan(out.absolute(), resolve(file, jobs, threads_each(choices), _names_of(before)), left_out)
+    return replace(plan, notes=tuple(_other_files(plan, before)))
+
+
+def _plan_in(out: Path) -> tuple[Record, ...]:
+    """The jobs of the plan that an output folder has; empty where it has none that can be read."""
+    try:
+        return read_plan(out / PLAN).jobs
+    except (InputRefused, UsageError):
+        return ()
+
+
+def _names_of(jobs: Sequence[Record]) -> dict[tuple[str, str], list[str]]:
+    """The names of a plan's jobs by their files, for `names.job_names`."""
+    result: dict[tuple[str, str], list[str]] = {}
+    for job in jobs:
+        result.setdefault(source_of(job).files(), []).append(job.name)
+    return result
+
+
+def _other_files(plan: BatchPlan, before: Sequence[Record]) -> list[str]:
+    """Notes on jobs whose folder has results of another mesh or style, by the plan that it was made with."""
+    known = {folded(job.name): job for job in before}
+    notes = []
+    for job in plan.jobs:
+        old = known.get(folded(job.name))
+        if old is None or source_of(old).files() == source_of(job).files() or not (plan.out / job.name).is_dir():
+            continue
+        if finished(plan, job) is None:  # else the files are the same, in another place
+            was, now = (" with ".join(map(str, inputs_of(record))) for record in (old, job))
+            notes.append(
+                f"{job.name}: its folder has results of {was}; this run replaces them and continues their versions "
+                f"with {now}. Name the job, or choose another -o, to keep both."
+            )
+    more = len(notes) - MOST_LISTED
+    return notes[:MOST_LISTED] + ([f"{more} more folders have results of other files."] if more > 0 else [])
+
+
+def opening_notes(plan: BatchPlan) -> list[str]:
+    """The notes of a plan that are due before anything runs."""
+    notes = []
+    if plan.moved_from is not None:
+        notes.append(f"This batch was made in {plan.moved_from} and is in {plan.out} now; it continues there.")
+    return [*notes, *plan.left_out, *plan.notes]
 
 
 def workers_of(choices: Choices) -> int:
@@ -109,7 +158,6 @@ def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, 
     """The summary: the state of every job of the plan, and the command that retries the failed ones."""
     rows = [_row(plan, k, job, ended.get(k)) for k, job in enumerate(plan.jobs)]
     failed = [row["name"] for row in rows if row["state"] == "failed"]
-    retry = ["mistyle", "batch", str(plan.out / PLAN), *(["--only", *failed] if failed else [])]
     return {
         "out": str(plan.out),
         "jobs": len(rows),
@@ -118,9 +166,17 @@ def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, 
         "open": sum(row["state"] == "open" for row in rows),
         "reused": reused,
         "seconds": round(seconds, 2),
-        "retry": shlex.join(retry) if failed else None,
+        "retry": retry_command(plan, failed) if failed else None,
+        "left_out": list(plan.left_out),
         "rows": rows,
     }
+
+
+def retry_command(plan: BatchPlan, names: Sequence[str]) -> str:
+    """The shell command that runs these jobs again. Names that begin with a dash would be read as options."""
+    plain = [name for name in names if not name.startswith("-")]
+    only = [*(["--only", *plain] if plain else []), *(f"--only={name}" for name in names if name.startswith("-"))]
+    return shlex.join(["mistyle", "batch", str(plan.out / PLAN), *only])
 
 
 def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) -> dict[str, Any]:
@@ -128,7 +184,7 @@ def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) 
     state, content = result.state, result.told
     if ended is not None and ended.code != 0:
         state = "failed" if ended.code not in (75, 130) else "open"
-    row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index}
+    row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index} | _files(job)
     if state == "done":
         row |= {k: content[k] for k in ("seconds", "peak_gb", "figures")} | {"notes": content.get("notes", [])}
     if state == "failed":
@@ -138,6 +194,12 @@ def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) 
         error = error or content.get("error") or f"the process ended with {code}"
         row |= {"exit_code": code, "error": error, "last_lines": engines.last_lines(plan, index)}
     return row
+
+
+def _files(job: Record) -> dict[str, str]:
+    """The paths of a job's files, for its row."""
+    kind = "style" if job.style is not None else "references"
+    return {"mesh": str(job.mesh), kind: str(job.style or job.references)}
 
 
 def describe(summary: dict[str, Any]) -> str:
@@ -167,7 +229,7 @@ def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
     rows = []
     for job in plan.jobs:
         done = finished(plan, job) is not None
-        row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done, "refused": None}
+        row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done, "refused": None} | _files(job)
         try:
             estimate = (plan_material if job.kind == "fit" else plan_style)(job_of(plan, job))
         except MistyleError as error:
@@ -178,6 +240,7 @@ def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
     workers = min(workers_of(choices), max(len(remaining), 1))
     return {
         "out": str(plan.out),
+        "left_out": list(plan.left_out),
         "jobs": rows,
         "workers": workers,
         "seconds": round(sum(row["seconds"] for row in remaining) / workers),

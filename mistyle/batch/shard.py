@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.batch.jobs_file import Record
-from mistyle.batch.plan import BatchPlan
+from mistyle.batch.plan import SHARDS, BatchPlan, inputs_of
 from mistyle.core.errors import MistyleError, Stopped
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.io.store import lock
@@ -27,8 +27,6 @@ from mistyle.jobs.progress import Progress
 from mistyle.jobs.stages import claim_run, program
 from mistyle.process.disk_errors import unexpected
 from mistyle.stylization.pipeline.job import STAGES
-
-SHARDS = "shards"
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def finished(plan: BatchPlan, job: Record, key: str | None = None) -> dict[str, 
 
 def claim_batch(plan: BatchPlan) -> None:
     """UsageError where the batch would overwrite an input, or a file in any job's folder that is not mistyle's."""
-    every = [path for job in plan.jobs for path in (job.mesh, job.style, job.references) if path is not None]
+    every = [path for job in plan.jobs for path in inputs_of(job)]
     claim(plan.out, ("plan.json", "batch.json", "batch.html"), [SHARDS], every, aside=True, overwrite=plan.overwrite)
     for job in plan.jobs:
         stages = MATERIAL_STAGES if job.kind == "fit" else STAGES

@@ -37,12 +37,12 @@ def _add_batch(verbs: Any) -> None:
             mistyle batch jobs.toml -o OUT/                        [[job]] and [[grid]] entries; also .yaml
             mistyle batch props/ -o OUT/ --dry-run                 every mesh of the folder with every picture
             mistyle batch jobs.toml -o OUT/ --workers 8 --watch    eight at a time, with a live table
-            mistyle batch OUT/plan.json                            resume unfinished jobs
+            mistyle batch OUT/                                     resume unfinished jobs, wherever OUT is now
             mistyle batch jobs.toml -o /share/OUT --engine ray --address auto --gpus 0.5
             """
         ),
     )
-    verb.add_argument("jobs", type=Path, metavar="JOBS", help="a .toml or .yaml file, a folder, or a plan.json")
+    verb.add_argument("jobs", type=Path, metavar="JOBS", help="a .toml or .yaml file, a folder, or the OUT of a batch")
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="folder of the whole batch")
     _add_machine_options(verb)
     verb.add_argument(
@@ -54,7 +54,14 @@ def _add_batch(verbs: Any) -> None:
         "--wait", type=float, default=300.0, metavar="S", help="Ray: seconds without a started job before giving up"
     )
     verb.add_argument("--timeout", type=float, metavar="S", help="stop a job that takes longer")
-    verb.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these jobs of the plan")
+    verb.add_argument(
+        "--only",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="only these jobs of the plan; --only=-b where a name begins with a dash",
+    )
     verb.add_argument("--watch", action="store_true", help="a live table instead of a line per job")
     verb.add_argument("--dry-run", action="store_true", help="print the plan with time, disk and memory, and stop")
     add_overwrite_option(verb)
@@ -168,7 +175,7 @@ def _pack(options: argparse.Namespace) -> int:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from mistyle.batch.pipeline import Choices, describe, describe_dry_run, dry_run, planned, run_batch, say
+    from mistyle.batch.pipeline import Choices, describe, describe_dry_run, dry_run, run_batch, say
 
     choices = Choices(
         engine=options.engine,
@@ -181,10 +188,7 @@ def _batch(options: argparse.Namespace) -> int:
         only=tuple(options.only),
         watch=options.watch and sys.stderr.isatty(),
     )
-    from mistyle.batch.plan import with_delivery
-
-    base = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(base, given_settings(options, DELIVERY_OPTIONS))
+    plan = _plan(options, choices)
     if options.dry_run:
         estimate = dry_run(plan, choices)
         print(json.dumps(estimate) if options.json else describe_dry_run(estimate))
@@ -194,6 +198,18 @@ def _batch(options: argparse.Namespace) -> int:
         print(json.dumps(summary))
     say(describe(summary))
     return 1 if summary["failed"] or summary["open"] and not choices.only else 0
+
+
+def _plan(options: argparse.Namespace, choices: Any) -> Any:
+    """The plan of JOBS with the command line's options; its notes are printed, since they come before the work."""
+    from mistyle.batch.pipeline import opening_notes, planned, say
+    from mistyle.batch.plan import with_delivery
+
+    base = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
+    plan = with_delivery(base, given_settings(options, DELIVERY_OPTIONS))
+    for note in opening_notes(plan):
+        say(f"note      {note}")
+    return plan
 
 
 def _shard(options: argparse.Namespace) -> int:
@@ -235,12 +251,11 @@ def _run_range(options: argparse.Namespace, chosen: Sequence[int]) -> int:
 
 def _farm(options: argparse.Namespace) -> int:
     from mistyle.batch.farm import ShardNeeds, export
-    from mistyle.batch.pipeline import Choices, planned, say, threads_each
-    from mistyle.batch.plan import path_maps, with_delivery
+    from mistyle.batch.pipeline import Choices, say, threads_each
+    from mistyle.batch.plan import path_maps
 
     choices = Choices(workers=options.workers, threads=options.threads)
-    base = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(base, given_settings(options, DELIVERY_OPTIONS))
+    plan = _plan(options, choices)
     needs = ShardNeeds(
         threads_each(choices),
         options.memory,

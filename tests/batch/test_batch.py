@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batch_parts import CUBE, done_by_hand, jobs_file, stand_in
 from PIL import Image
 
 from mistyle.batch import engines
@@ -16,33 +17,8 @@ from mistyle.batch.jobs_file import read_jobs
 from mistyle.batch.page import write_page
 from mistyle.batch.pipeline import Choices, describe, describe_dry_run, dry_run, planned, run_batch, summarise
 from mistyle.batch.plan import PLAN, indices, path_maps, read_plan, replaced, write_plan
-from mistyle.batch.shard import finished, key_of, marker, outcome
+from mistyle.batch.shard import finished, marker, outcome
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
-
-CUBE = """v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1
-f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 4 7 3\nf 4 8 7\nf 1 5 8\nf 1 8 4\nf 2 3 7\nf 2 7 6
-"""
-
-
-@pytest.fixture
-def props(tmp_path) -> Path:
-    """A folder with two meshes and two pictures."""
-    folder = tmp_path / "props"
-    (folder / "meshes").mkdir(parents=True)
-    (folder / "styles").mkdir()
-    for name in ("cube", "box"):
-        (folder / "meshes" / f"{name}.obj").write_text(CUBE)
-    rng = np.random.default_rng(0)
-    for k, name in enumerate(("wave", "ink")):
-        pixels = (rng.random((12, 16, 3)) * 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
-        Image.fromarray(pixels).save(folder / "styles" / f"{name}.{('png', 'jpg')[k]}")
-    return folder
-
-
-def jobs_file(folder: Path, text: str, name: str = "jobs.toml") -> Path:
-    path = folder / name
-    path.write_text(text)
-    return path
 
 
 def test_a_folder_is_a_grid_of_what_lies_in_it(props):
@@ -140,6 +116,19 @@ def test_a_list_a_grid_and_what_holds_for_all(props):
     assert first["rig"]["resolution"] == 512  # of the preset
     assert records[2].settings["seed"] == 7
     assert records[3].settings["rig"]["resolution"] == 1024
+
+
+def test_a_file_with_brackets_in_its_name_is_that_file(props, tmp_path):
+    (props / "meshes" / "[v2] cube.obj").write_text(CUBE)
+    (props / "styles" / "wave?*.png").write_bytes((props / "styles" / "wave.png").read_bytes())
+    text = '[[grid]]\nmeshes = ["meshes/[v2] cube.obj", "meshes/[b]*.obj"]\nstyles = ["styles/wave?*.png"]\n'
+    records = read_jobs(jobs_file(props, text), 1)
+    assert [record.mesh.name for record in records] == ["[v2] cube.obj", "box.obj"]
+    assert all(record.style is not None and record.style.name == "wave?*.png" for record in records)
+    # A folder names its own files.
+    assert {record.mesh.name for record in read_jobs(props, 1)} == {"[v2] cube.obj", "box.obj", "cube.obj"}
+    with pytest.raises(InputRefused, match="matches no file"):
+        read_jobs(jobs_file(props, text.replace("[v2]", "[v3]")), 1)
 
 
 def test_yaml_says_the_same(props):
@@ -244,26 +233,6 @@ def test_indices():
             indices(wrong, 4)
 
 
-def done_by_hand(plan, index: int) -> None:
-    """What a finished shard leaves behind, without the work."""
-    job = plan.jobs[index]
-    asset = plan.out / job.name / "asset" / "a.glb"
-    asset.parent.mkdir(parents=True)
-    asset.write_bytes(b"glTF")
-    from mistyle.io.store.atomic import sha256_file
-    from mistyle.io.store.output import keep_folder
-
-    keep_folder(plan.out / job.name, "asset")
-    keep_folder(plan.out, "shards")
-
-    told = {
-        "name": job.name, "key": key_of(job), "files": {f"{job.name}/asset/a.glb": sha256_file(asset)},
-        "seconds": 3.5, "peak_gb": 1.0, "figures": {"style": 0.5},
-    }  # fmt: skip
-    marker(plan, job).parent.mkdir(parents=True, exist_ok=True)
-    marker(plan, job).write_text(json.dumps(told))
-
-
 def test_a_shard_is_done_only_while_its_key_and_its_files_hold(props, tmp_path):
     plan = planned(props, tmp_path / "out", Choices(threads=1))
     job = plan.jobs[0]
@@ -278,11 +247,6 @@ def test_a_shard_is_done_only_while_its_key_and_its_files_hold(props, tmp_path):
     assert finished(plan, job) is not None
     job.mesh.write_text(CUBE + "v 0 0 0\n")
     assert finished(plan, job) is None
-
-
-def stand_in(monkeypatch, script: str) -> None:
-    """Shards that run `script` with the job's number as its argument instead."""
-    monkeypatch.setattr(engines, "command", lambda plan, index, maps=(): [sys.executable, "-c", script, str(index)])
 
 
 def test_one_failing_shard_does_not_stop_the_others(props, tmp_path, monkeypatch):
