@@ -29,7 +29,7 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel, Field
 
 from mistyle.batch.folder_jobs import folder_jobs
-from mistyle.batch.names import Before, Source, job_names, why_not
+from mistyle.batch.names import Before, JobSource, job_names, why_not
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.names import folded
 from mistyle.core.settings import FrozenModel
@@ -161,17 +161,17 @@ def _file_jobs(path: Path) -> JobsFile:
     return validate(values, str(path), JobsFile)
 
 
-def source_of(job: Record) -> Source:
+def source_of(job: Record) -> JobSource:
     """What a resolved job is named after."""
-    return Source(job.mesh, job.style if job.style is not None else (job.references or Path()) / "fit")
+    return JobSource(job.mesh, job.style if job.style is not None else (job.references or Path()) / "fit")
 
 
-def _source(job: BatchJob, base: Path, rest: tuple[str, ...] = ()) -> Source:
+def _source(job: BatchJob, base: Path, rest: tuple[str, ...] = ()) -> JobSource:
     second = job.style if job.style is not None else (job.references or Path()) / "fit"
-    return Source(base / job.mesh, base / second, rest, job.name)
+    return JobSource(base / job.mesh, base / second, rest, job.name)
 
 
-def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[tuple[BatchJob, Source]]:
+def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[tuple[BatchJob, JobSource]]:
     """The jobs of a grid, meshes first."""
     meshes, styles = _expanded(grid.meshes, base, origin), _expanded(grid.styles, base, origin)
     result = []

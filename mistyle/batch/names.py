@@ -20,7 +20,7 @@ DIGEST = 6  # hexadecimal digits of a name that nothing else tells apart
 
 
 @dataclass(frozen=True)
-class Source:
+class JobSource:
     """What a job is named after.
 
     second  the style picture; for a fit `fit` in the folder of references
@@ -43,10 +43,10 @@ class Source:
 
 
 Before = Mapping[tuple[str, str], Sequence[str]]
-"""The names in the plan of the batch's folder, by `Source.files`."""
+"""The names in the plan of the batch's folder, by `JobSource.files`."""
 
 
-def job_names(sources: Sequence[Source], base: Path, before: Before | None = None) -> list[str]:
+def job_names(sources: Sequence[JobSource], base: Path, before: Before | None = None) -> list[str]:
     """Distinct names of the jobs, safe as names of folders.
 
     The user's names come first, then those of the plan `before`, then plain names. Jobs of equal plain names get the
@@ -83,7 +83,7 @@ def why_not(name: str, others: Collection[str]) -> str:
     return ""
 
 
-def _to_be_marked(group: Sequence[int], sources: Sequence[Source], rank: Sequence[int]) -> list[int]:
+def _to_be_marked(group: Sequence[int], sources: Sequence[JobSource], rank: Sequence[int]) -> list[int]:
     """The jobs of equal names that yield: all but those of the first rank, and these too where only folders or endings
     name them."""
     if len({sources[k].files() for k in group}) < 2:
@@ -92,7 +92,7 @@ def _to_be_marked(group: Sequence[int], sources: Sequence[Source], rank: Sequenc
     return [k for k in group if rank[k] > first or first == 3]
 
 
-def _told_apart(sources: Sequence[Source]) -> list[str]:
+def _told_apart(sources: Sequence[JobSource]) -> list[str]:
     """Names with the folder or the ending of the meshes, of the styles, or of both: whichever is enough."""
     pairs = {source.files() for source in sources}
     meshes, seconds = _labels([s.mesh for s in sources]), _labels([s.second for s in sources])
@@ -131,7 +131,7 @@ def _differing(folders: set[tuple[str, ...]]) -> dict[tuple[str, ...], list[str]
     return {folder: [near[folder][k] for k in levels if near[folder][k]] for folder in folders}
 
 
-def _kept(sources: Sequence[Source], before: Before) -> dict[int, str]:
+def _kept(sources: Sequence[JobSource], before: Before) -> dict[int, str]:
     """The jobs that the plan before has too, with their names in it."""
     left = {files: list(names) for files, names in before.items()}
     result = {}
@@ -144,7 +144,7 @@ def _kept(sources: Sequence[Source], before: Before) -> dict[int, str]:
     return result
 
 
-def _form(source: Source) -> Callable[[str], object]:
+def _form(source: JobSource) -> Callable[[str], object]:
     """Whether a name is one that this job may have had: its own words, with any that told it apart."""
 
     def word(path: Path) -> str:

@@ -81,18 +81,20 @@ def _names_of(jobs: Sequence[Record]) -> dict[tuple[str, str], list[str]]:
 
 
 def _other_files(plan: BatchPlan, before: Sequence[Record]) -> list[str]:
-    """Notes on jobs whose folder has results of another mesh or style, by the plan that it was made with."""
-    known = {folded(job.name): job for job in before}
+    """Notes on jobs whose folder has results of another mesh or style, by the plan or the marker that it has."""
+    known = {folded(job.name): [str(path) for path in inputs_of(job)] for job in before}
     notes = []
     for job in plan.jobs:
-        old = known.get(folded(job.name))
-        if old is None or source_of(old).files() == source_of(job).files() or not (plan.out / job.name).is_dir():
+        if not (plan.out / job.name).is_dir():
+            continue
+        was = known.get(folded(job.name)) or outcome(plan, job).told.get("inputs")
+        now = [str(path) for path in inputs_of(job)]
+        if not was or list(map(os.path.realpath, was)) == list(map(os.path.realpath, now)):
             continue
         if finished(plan, job) is None:  # else the files are the same, in another place
-            was, now = (" with ".join(map(str, inputs_of(record))) for record in (old, job))
             notes.append(
-                f"{job.name}: its folder has results of {was}; this run replaces them and continues their versions "
-                f"with {now}. Name the job, or choose another -o, to keep both."
+                f"{job.name}: its folder has results of {' with '.join(was)}; this run replaces them and continues "
+                f"their versions with {' with '.join(now)}. Name the job, or choose another -o, to keep both."
             )
     more = len(notes) - MOST_LISTED
     return notes[:MOST_LISTED] + ([f"{more} more folders have results of other files."] if more > 0 else [])

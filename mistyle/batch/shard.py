@@ -111,6 +111,7 @@ def run_shard(plan: BatchPlan, index: int, progress: Progress) -> dict[str, Any]
     content = {
         "name": job.name,
         "key": key,
+        "inputs": [str(path) for path in inputs_of(job)],
         "files": {p.relative_to(plan.out).as_posix(): sha256_file(p) for p in written},
         "seconds": round(time.monotonic() - start, 2),
         "peak_gb": round(float(summary["peak_gb"]), 3),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from batch_parts import CUBE, done_by_hand, jobs_file, stand_in
 
-from mistyle.batch.names import OWN, Source, job_names
+from mistyle.batch.names import OWN, JobSource, job_names
 from mistyle.batch.page import write_page
 from mistyle.batch.pipeline import Choices, dry_run, opening_notes, planned, run_batch
 from mistyle.batch.plan import PLAN, SHARDS, write_plan
@@ -22,7 +22,7 @@ BASE = Path("/show")
 
 
 def named(*files: str, style: str = "s/style.png", before=None) -> list[str]:
-    return job_names([Source(BASE / file, BASE / style) for file in files], BASE, before)
+    return job_names([JobSource(BASE / file, BASE / style) for file in files], BASE, before)
 
 
 @pytest.mark.parametrize(
@@ -46,13 +46,13 @@ def test_equal_names_are_told_apart_by_folder_or_ending(files, names):
 
 
 def test_styles_and_references_tell_apart_too():
-    sources = [Source(BASE / "a.obj", BASE / f"{kind}/wave.png") for kind in ("ink", "oil")]
+    sources = [JobSource(BASE / "a.obj", BASE / f"{kind}/wave.png") for kind in ("ink", "oil")]
     assert job_names(sources, BASE) == ["a_ink_wave", "a_oil_wave"]
-    sources += [Source(BASE / "p/a.obj", BASE / "ink/wave.png")]
+    sources += [JobSource(BASE / "p/a.obj", BASE / "ink/wave.png")]
     assert job_names(sources, BASE) == ["show_a_ink_wave", "show_a_oil_wave", "p_a_ink_wave"]
-    fits = [Source(BASE / "chair.glb", BASE / shots / "fit") for shots in ("day", "night")]
+    fits = [JobSource(BASE / "chair.glb", BASE / shots / "fit") for shots in ("day", "night")]
     assert job_names(fits, BASE) == ["chair_day_fit", "chair_night_fit"]
-    variants = [Source(BASE / f"{k}/m.obj", BASE / "s.png", (v,)) for k in "ab" for v in ("v0", "v1")]
+    variants = [JobSource(BASE / f"{k}/m.obj", BASE / "s.png", (v,)) for k in "ab" for v in ("v0", "v1")]
     assert job_names(variants, BASE) == ["a_m_s_v0", "a_m_s_v1", "b_m_s_v0", "b_m_s_v1"]
 
 
@@ -68,7 +68,7 @@ def test_what_no_name_tells_apart_gets_a_digest_that_does_not_depend_on_the_othe
 
 
 def test_a_name_of_the_user_comes_first():
-    sources = [Source(BASE / "a.obj", BASE / "s.png"), Source(BASE / "b.obj", BASE / "s.png", chosen="a_s")]
+    sources = [JobSource(BASE / "a.obj", BASE / "s.png"), JobSource(BASE / "b.obj", BASE / "s.png", chosen="a_s")]
     first, second = job_names(sources, BASE)
     assert second == "a_s" and first.startswith("a_s-") and not first.endswith("-2")
     before = {sources[1].files(): ["b_s"], sources[0].files(): ["a_s"]}
@@ -77,7 +77,7 @@ def test_a_name_of_the_user_comes_first():
 
 def test_names_of_the_plan_before_stay():
     def files(file: str) -> tuple[str, str]:
-        return Source(BASE / file, BASE / "s/style.png").files()
+        return JobSource(BASE / file, BASE / "s/style.png").files()
 
     before = {files("bench/model.obj"): ["model_style"], files("chair/model.obj"): ["model_style-2"]}
     three = ["sofa/model.obj", "bench/model.obj", "chair/model.obj"]
@@ -174,6 +174,9 @@ def test_a_folder_of_another_mesh_is_noted_before_anything_runs(props, tmp_path,
     assert note.startswith("hero: ") and "cube.obj" in note and "box.obj" in note
     assert main(["batch", str(props / "jobs.toml"), "-o", str(out), "--threads", "1", "--dry-run"]) == 0
     assert note in capsys.readouterr().err
+    # A plan without the job is forgotten, the mark of the finished job is not.
+    write_plan(replace(plan, jobs=()))
+    assert planned(listed("box"), out, ONE).notes == (note,)
     # The same content at another path is not another mesh: the job is done.
     shutil.copy(props / "meshes" / "cube.obj", props / "meshes" / "copy.obj")
     assert not planned(listed("copy"), out, ONE).notes

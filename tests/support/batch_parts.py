@@ -31,7 +31,7 @@ def done_by_hand(plan, index: int) -> None:
 
     told = {
         "name": job.name, "key": key_of(job), "files": {f"{job.name}/asset/a.glb": sha256_file(asset)},
-        "seconds": 3.5, "peak_gb": 1.0, "figures": {"style": 0.5},
+        "inputs": [str(job.mesh), str(job.style)], "seconds": 3.5, "peak_gb": 1.0, "figures": {"style": 0.5},
     }  # fmt: skip
     marker(plan, job).parent.mkdir(parents=True, exist_ok=True)
     marker(plan, job).write_text(json.dumps(told))
