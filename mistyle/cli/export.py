@@ -69,6 +69,7 @@ def _export(options: argparse.Namespace) -> int:
             ),
             overwrite=options.overwrite,
             note=progress.note,
+            say=progress.say,
         )
     if options.json:
         print(json.dumps({"files": [str(p) for p in files], "notes": progress.notes}))
