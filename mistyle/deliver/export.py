@@ -19,11 +19,11 @@ from typing import Any
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, FILE_NAME, folded, safe_name, shortened
 from mistyle.deliver.colour import key_of, light_space, picture_space
+from mistyle.deliver.exclusive import hold
 from mistyle.deliver.files import Delivery, fields_for, write_delivery
 from mistyle.deliver.read_asset import FinishedAsset, read_finished, read_listing
 from mistyle.io.images.packing import TARGETS
 from mistyle.io.sandbox.bounds import USD
-from mistyle.io.store import lock
 from mistyle.io.store.atomic import LOCK, atomic_write, digest, sha256_file
 from mistyle.io.store.output import claim, keep_folder, read_written, real, replace_files
 from mistyle.io.store.trusted_json import read_own
@@ -86,7 +86,7 @@ def export(
     called, version = _versioned_name(out, request.name, fields, of)
     if not _is_current(out, called, of):
         claim(out, named_files(formats, called), inputs=inputs, overwrite=overwrite)
-        with lock.hold(real(out) / LOCK, say):
+        with hold(real(out) / LOCK, say):
             # Another export may have taken the name while this one waited.
             called, version = _versioned_name(out, request.name, fields, of)
             if not _is_current(out, called, of):

@@ -15,16 +15,16 @@ from gltf_cases import no_texels, quad, quarters
 
 from mistyle.core.errors import UsageError
 from mistyle.deliver.asset import write_asset
+from mistyle.deliver.exclusive import hold
 from mistyle.deliver.export import DeliveryRequest, export
-from mistyle.io.store import lock
 from mistyle.io.store.atomic import LOCK, sha256_file
 
 EXPORT = "import sys; from mistyle.cli.main import main; sys.exit(main(['export', *sys.argv[1:]]))"
 HOLD = """
 import sys, time
 from pathlib import Path
-from mistyle.io.store import lock
-with lock.hold(Path(sys.argv[1])):
+from mistyle.deliver.exclusive import hold
+with hold(Path(sys.argv[1])):
     print('held', flush=True)
     time.sleep(60)
 """
@@ -102,9 +102,9 @@ def test_waiting_ends_with_a_sentence_that_names_the_holder(tmp_path):
     place = tmp_path / LOCK
     told: list[str] = []
     with (
-        lock.hold(place),
+        hold(place),
         pytest.raises(UsageError, match=f"process {os.getpid()}"),
-        lock.hold(place, told.append, 0.5),
+        hold(place, told.append, 0.5),
     ):
         pass
     assert len(told) == 1 and not place.exists()
@@ -123,6 +123,6 @@ def test_an_equal_delivery_needs_no_lock(tmp_path):
     request = DeliveryRequest(formats=["glb"], target="blender")
     files = export(run, out, request)
     since = time.monotonic()
-    with lock.hold(out / LOCK):
+    with hold(out / LOCK):
         assert export(run, out, request) == files
     assert time.monotonic() - since < 5

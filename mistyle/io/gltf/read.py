@@ -160,11 +160,11 @@ def _pieces(
         if "skin" in entry:
             joints, root = joint_matrices(tree, buffers, entry["skin"], world, path)
             matrix = joints[root]
-            notes.append("A skinned mesh was read in the pose of its joints; skin and animations stay as they are.")
+            notes.append("A skinned mesh was read in the pose of its joints; skin and animations stay in the GLB.")
         if not np.isfinite(matrix if joints is None else joints).all():
             raise refuse(path, f"node {node} with a transform that is not finite", "finite numbers", AGAIN)
         if _flattened(matrix):
-            notes.append("Nodes that are scaled to a point or a line were left out; they stay in a finished asset.")
+            notes.append("Nodes that are scaled to a point or a line were left out; they stay in the GLB.")
             continue
         for instance in _instances(tree, buffers, entry, min(max_faces, MAX_INSTANCED) - faces, notes):
             placed: dict[str, _Place] = {}
@@ -331,7 +331,7 @@ def _scene_nodes(tree: Tree, notes: list[str]) -> list[int]:
             continue
         seen.add(node)
         if _hidden(nodes[node]):
-            notes.append("Hidden nodes (KHR_node_visibility) were left out; they stay in a finished asset.")
+            notes.append("Hidden nodes (KHR_node_visibility) were left out; they stay in the GLB.")
             continue
         order.append(node)
         stack.extend(reversed(nodes[node].get("children", [])))

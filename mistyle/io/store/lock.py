@@ -10,58 +10,20 @@ import json
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.io.store.trusted_json import read_own
-from mistyle.process import disk_errors
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None
 
-PATIENCE = 600.0  # seconds that `hold` waits
 _HANDLES: dict[str, int] = {}
 _COUNTER = itertools.count()
-
-
-@contextlib.contextmanager
-def hold(lock: Path, say: Callable[[str], None] = lambda text: None, seconds: float = PATIENCE) -> Iterator[None]:
-    """Hold a folder's lock for a block; wait up to `seconds` for its holder, which `say` names once.
-
-    The folder is made where it is absent; if it is still empty at the end, it is removed again. Raises UsageError as
-    `take` does.
-    """
-    absent = [place for place in (lock.parent, *lock.parent.parents) if not place.exists()]
-    try:
-        with disk_errors.translated(lock.parent):
-            owner = _take_when_free(lock, say, seconds)
-        try:
-            yield
-        finally:
-            release(lock, owner)
-    finally:
-        with contextlib.suppress(OSError):
-            for place in absent:
-                place.rmdir()
-
-
-def _take_when_free(lock: Path, say: Callable[[str], None], seconds: float) -> str:
-    since, told = time.monotonic(), False
-    while True:
-        lock.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            return take(lock)
-        except (UsageError, FileNotFoundError) as error:  # a holder that wrote nothing may have removed the folder
-            if time.monotonic() - since >= seconds:
-                raise
-            if not told and isinstance(error, UsageError):
-                say(f"waiting up to {seconds:g} s: {error}")
-                told = True
-        time.sleep(0.2)
 
 
 def take(lock: Path) -> str:
