@@ -14,6 +14,7 @@ from mistyle.io.gltf.glb import Buffers, values
 from mistyle.io.gltf.infos import base_set, sees_through, wanted_sets
 from mistyle.io.gltf.materials import read_material
 from mistyle.io.gltf.pose import INSTANCING, instances, joint_matrices, mirrors, morphed, posed, skinned, turned
+from mistyle.io.gltf.variants import variant_notes
 from mistyle.io.gltf.vertices import triangles
 from mistyle.io.images.read import Budget
 from mistyle.io.meshes.parsed_mesh import Corners, Indexed, Raw, RawMaterial
@@ -77,6 +78,7 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
     kind = np.min_scalar_type(-len(used))
     material = np.repeat(np.array([used.index(p.material) for p in pieces], kind), counts)
     materials = _materials(tree, buffers, path, pieces, used, notes)
+    notes += variant_notes(tree, set(used))
     starts = np.cumsum([0, *counts])
     primitives = tuple(
         Primitive(p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex)
