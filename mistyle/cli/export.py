@@ -69,6 +69,7 @@ def _export(options: argparse.Namespace) -> int:
             ),
             overwrite=options.overwrite,
             note=progress.note,
+            say=progress.say,
         )
     if options.json:
         print(json.dumps({"files": [str(p) for p in files], "notes": progress.notes}))
@@ -90,7 +91,7 @@ def add_verify(verbs: Any) -> None:
             """
         ),
     )
-    verb.add_argument("asset", type=Path, metavar="ASSET", help="a run, asset or delivered folder, or one file")
+    verb.add_argument("asset", type=Path, metavar="ASSET", help="a run, batch, asset or delivered folder, or one file")
     verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="pictures and verify.json (default ASSET/verify)")
     verb.add_argument(
         "--blender", metavar="PATH", help="blender, or a python with bpy (default: on PATH, or MISTYLE_BLENDER_PYTHON)"

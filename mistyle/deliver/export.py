@@ -5,7 +5,8 @@ OUT/<mesh>_look.usda                               instead of .usda and .usdz, w
 OUT/textures/<name>_<map>[.<udim>].<ext>           packed for the target
 OUT/<name>.export.json                             every file with sha256, colour space and channels
 
-Deliveries of several names share the folder; a new delivery of the same name replaces only its own files.
+Deliveries of several names share the folder; a new delivery of the same name replaces only its own files. The folder's
+lock admits one export at a time, so that no two take the same version or mix their files.
 """
 
 import json
@@ -18,12 +19,13 @@ from typing import Any
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, FILE_NAME, folded, safe_name, shortened
 from mistyle.deliver.colour import key_of, light_space, picture_space
+from mistyle.deliver.exclusive import hold
 from mistyle.deliver.files import Delivery, fields_for, write_delivery
 from mistyle.deliver.read_asset import FinishedAsset, read_finished, read_listing
 from mistyle.io.images.packing import TARGETS
 from mistyle.io.sandbox.bounds import USD
-from mistyle.io.store.atomic import atomic_write, digest, sha256_file
-from mistyle.io.store.output import claim, keep_folder, read_written, replace_files
+from mistyle.io.store.atomic import LOCK, atomic_write, digest, sha256_file
+from mistyle.io.store.output import claim, keep_folder, read_written, real, replace_files
 from mistyle.io.store.trusted_json import read_own
 from mistyle.jobs.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
 from mistyle.jobs.stages import program
@@ -56,10 +58,12 @@ def export(
     *,
     overwrite: bool = False,
     note: Callable[..., None] = lambda *sentences: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> list[Path]:
     """Deliver the asset at `place` into the folder `out`; returns the delivery's files.
 
-    `note` receives notes about the files. UsageError for an unknown format, target or name pattern.
+    `note` receives notes about the files, `say` a sentence where another export must be waited for. UsageError for an
+    unknown format, target or name pattern.
     """
     _check_request(request)
     formats, target, source = tuple(request.formats), request.target, request.source
@@ -77,17 +81,24 @@ def export(
             source,
         ]
     )
-    called, version = _versioned_name(out, request.name, fields_for(manifest, target), of)
-    space = light_space(request.colour)
-    chosen = Delivery(formats, target, called, version, request.names, request.metres_per_unit, space, source)
+    fields, space = fields_for(manifest, target), light_space(request.colour)
+    inputs = [place, folder, *([source] if source else [])]
+    called, version = _versioned_name(out, request.name, fields, of)
     if not _is_current(out, called, of):
-        inputs = [place, folder, *([source] if source else [])]
-        claim(out, named_files(chosen), inputs=inputs, overwrite=overwrite)
-        finished = read_finished(place)
-        replace_files(
-            out, f"export {called}", lambda new: _deliver(new, out, finished, chosen, of), inputs=inputs,
-            overwrite=overwrite, lasting=lambda name: name.endswith("_look.usda"),
-        )  # fmt: skip
+        claim(out, named_files(formats, called), inputs=inputs, overwrite=overwrite)
+        with hold(real(out) / LOCK, say):
+            # Another export may have taken the name while this one waited.
+            called, version = _versioned_name(out, request.name, fields, of)
+            if not _is_current(out, called, of):
+                claim(out, named_files(formats, called), inputs=inputs, overwrite=overwrite)
+                chosen = Delivery(
+                    formats, target, called, version, request.names, request.metres_per_unit, space, source
+                )
+                finished = read_finished(place)
+                replace_files(
+                    out, f"export {called}", lambda new: _deliver(new, out, finished, chosen, of), inputs=inputs,
+                    overwrite=overwrite, lasting=lambda name: name.endswith("_look.usda"),
+                )  # fmt: skip
     record = read_own(out / f"{called}.export.json")
     note(*record.get("notes", ()))
     return sorted([out / f"{called}.export.json", *(out / str(e["file"]) for e in record["files"])])
@@ -159,11 +170,11 @@ def _deliver(new: Path, out: Path, finished: FinishedAsset, chosen: Delivery, of
         )
 
 
-def named_files(chosen: Delivery) -> list[str]:
+def named_files(formats: Sequence[str], name: str) -> list[str]:
     """The files of a delivery that have its name; the names of textures depend on the asset."""
     endings = {"glb": (".glb",), "usd": (".usda", ".usdz"), "mtlx": (".mtlx",), "obj": (".obj", ".mtl")}
-    every = (".export.json", *(e for f in chosen.formats for e in endings.get(f, ())))
-    return [f"{chosen.name}{ending}" for ending in every]
+    every = (".export.json", *(e for f in formats for e in endings.get(f, ())))
+    return [f"{name}{ending}" for ending in every]
 
 
 def check(settings: Any) -> None:
@@ -199,6 +210,7 @@ def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
                 ),
                 overwrite=job.overwrite,
                 note=progress.note,
+                say=progress.say,
             )
             delivered[target] = [str(path) for path in files]
             report(len(delivered) / len(chosen.chosen_targets))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.asset import TURNED
+from mistyle.core.asset import TURNED, Material
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.names import (
     IDENTIFIER,
@@ -20,10 +20,11 @@ from mistyle.core.names import (
     uses,
 )
 from mistyle.core.paths import real_path
+from mistyle.deliver.losses import features, losses, suffix_of_source
 from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.images.ocio import ColourSpace, exr_tags
 from mistyle.io.images.packing import FILM_HEIGHT, HEIGHT, TARGETS, Target, TextureSet, write_slot
-from mistyle.io.materialx import HeightFile, TexturedMaterial, write_materialx
+from mistyle.io.materialx import HeightFile, TexturedMaterial, Transparency, write_materialx
 from mistyle.io.meshes.obj_write import write_obj
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
@@ -76,9 +77,10 @@ def write_delivery(folder: Path, out: Path, finished: FinishedAsset, chosen: Del
             about |= height_of(slot, textures)
             about |= {"normal": "-Y (DirectX)" if down else "+Y (OpenGL)"} if slot.map == "normal" else {}
             written.append({"file": f"textures/{file}", **about})
-    shared = []
+    shared, found = [], features(finished) if set(chosen.formats) != {"glb"} else {}
     if referring:
-        shared = _materials(folder, out, finished, chosen, _looks(finished, chosen, pattern, labels, slots))
+        looks = _looks(finished, chosen, pattern, labels, slots)
+        shared = _materials(folder, out, finished, chosen, looks, "double sides" in found)
     if "glb" in chosen.formats:
         shutil.copy2(finished.folder / f"{finished.manifest['name']}.glb", folder / f"{chosen.name}.glb")
     textures_by_file = {e["file"]: e for e in written}
@@ -90,7 +92,7 @@ def write_delivery(folder: Path, out: Path, finished: FinishedAsset, chosen: Del
     record = {"name": chosen.name, "asset": finished.manifest["name"], "version": chosen.version}
     record |= {"target": chosen.target, "about": target.about, "formats": list(chosen.formats), "files": listed}
     record |= {"sets": [s.name for s in finished.sets], "maps": sorted({s.map for s in slots})}
-    record |= {"notes": list(notes(finished, chosen))}
+    record |= {"notes": list(notes(finished, chosen, found))}
     return record | {"provenance": finished.manifest.get("provenance", {})}
 
 
@@ -104,12 +106,12 @@ def _slots(formats: Sequence[str], target: Target, referring: bool) -> list[Any]
     return slots
 
 
-def notes(finished: FinishedAsset, chosen: Delivery) -> tuple[str, ...]:
-    """Notes about the delivered files."""
-    turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text]
-    if not turned or "obj" not in chosen.formats:
-        return ()
-    return (f"{chosen.name}.obj has Y up, which OBJ cannot state. {turned[0]}",)
+def notes(finished: FinishedAsset, chosen: Delivery, found: Mapping[str, str]) -> tuple[str, ...]:
+    """Notes about the delivered files: a turned mesh, and the features `found` that a format lacks."""
+    turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text][: "obj" in chosen.formats]
+    up = [f"{chosen.name}.obj has Y up, which OBJ cannot state. {text}" for text in turned]
+    layered = suffix_of_source(finished) in USD  # a look layer lies over its source, which has everything
+    return (*up, *losses(found, [f for f in chosen.formats if not (f == "usd" and layered)]))
 
 
 def height_of(slot: Any, textures: TextureSet) -> dict[str, float]:
@@ -184,19 +186,34 @@ def _looks(
     names = distinct([identifier(part) for part in parts], limit=IDENTIFIER)
     titles = distinct([safe_name(part, STEM) for part in parts], limit=STEM)
     looks = []
-    for name, title, label, textures in zip(names, titles, labels, finished.sets, strict=True):
+    for part, (name, title, label, textures) in enumerate(zip(names, titles, labels, finished.sets, strict=True)):
         files = [f"textures/{texture_name(pattern, label, textures.tile, m, 'exr' if exr else 'png')}" for m in SINGLE]
         raised = next((slot for slot in slots if slot.map == "height"), None)
         bump = None
         if raised is not None:
             file = f"textures/{texture_name(pattern, label, textures.tile, 'height', raised.ext)}"
             bump = HeightFile(file, **height_of(raised, textures))
-        looks.append(TexturedMaterial(name, *files, srgb=not exr, space=chosen.space, title=title, height=bump))
+        light = _light(finished.asset.materials[part], textures)
+        looks.append(
+            TexturedMaterial(name, *files, srgb=not exr, space=chosen.space, title=title, height=bump, light=light)
+        )
     return looks
 
 
+def _light(material: Material, textures: TextureSet) -> Transparency:
+    """The opacity and the emission of a material of the GLB. An emission texture has UVs of its own and is left out."""
+    shading = material.shading
+    glow = shading.emission if material.emission is None else (0.0, 0.0, 0.0)
+    return Transparency(textures.alpha is not None, shading.opacity, shading.cutoff, glow)
+
+
 def _materials(
-    folder: Path, out: Path, finished: FinishedAsset, chosen: Delivery, looks: Sequence[TexturedMaterial]
+    folder: Path,
+    out: Path,
+    finished: FinishedAsset,
+    chosen: Delivery,
+    looks: Sequence[TexturedMaterial],
+    double_sided: bool,
 ) -> list[str]:
     """Write USD, MaterialX and OBJ, which refer to the unpacked maps; returns the files that deliveries share."""
     tiles = [textures.tile for textures in finished.sets]
@@ -205,13 +222,14 @@ def _materials(
         write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks)
     if "mtlx" in chosen.formats:
         write_materialx(folder / f"{chosen.name}.mtlx", looks)
-    if "usd" in chosen.formats and Path(str(finished.manifest.get("source", ""))).suffix.lower() in USD:
+    if "usd" in chosen.formats and suffix_of_source(finished) in USD:
         return _look_layer(folder, out, finished, chosen, looks)
     if "usd" in chosen.formats:
         from mistyle.io.usd.write import write_usd, write_usdz
 
         stage = folder / f"{chosen.name}.usda"
-        write_usd(stage, identifier(chosen.name), mesh, positions, looks, metres_per_unit=chosen.unit)
+        scale: Any = {"metres_per_unit": chosen.unit, "double_sided": double_sided}
+        write_usd(stage, identifier(chosen.name), mesh, positions, looks, **scale)
         write_usdz(stage.with_suffix(".usdz"), stage)
     return []
 

@@ -13,6 +13,8 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.io.images.packing import TextureSet
 
+SHARDS = "shards"  # the markers of a batch's jobs
+
 
 @dataclass(frozen=True)
 class FinishedAsset:
@@ -63,9 +65,20 @@ def read_listing(place: Path) -> tuple[Path, dict[str, Any]]:
     return listing.parent, manifest
 
 
+def jobs_of_batch(place: Path) -> list[Path] | None:
+    """The run folders with an asset in a batch folder (batch/pipeline.py); None for any other place."""
+    if not ((place / "plan.json").is_file() and (place / SHARDS).is_dir()):
+        return None
+    return [p for p in sorted(place.iterdir()) if (p / "asset").is_dir()]
+
+
 def _listing(place: Path) -> Path:
-    if place.suffix == ".json":
+    if place.suffix == ".json" and not place.is_dir():
         return place
+    jobs = jobs_of_batch(place)
+    if jobs is not None:
+        way = f"one job's folder in it, for example {jobs[0]}" if jobs else "a folder of a finished job in it"
+        raise InputRefused(f"{place}: found a batch folder with {len(jobs)} finished assets, expected {way}")
     for folder in (place / "asset", place):
         listings = [p for p in sorted(folder.glob("*.json")) if p.name != "done.json"] if folder.is_dir() else []
         if listings:

@@ -6,6 +6,7 @@ OUT/renders/*.exr     the renders, linear Rec.709
 """
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, MistyleError
+from mistyle.deliver.read_asset import SHARDS, jobs_of_batch
 from mistyle.deliver.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
 from mistyle.deliver.verify_surfaces import surface_checks
 from mistyle.io.images.write import write_exr, write_png
@@ -25,6 +27,8 @@ from mistyle.render.external.blender import BLENDER, find_blender
 
 # Two correct renderers differ by noise (FLIP 0.05 to 0.09 at 64 samples) and by their pixel filters.
 MOST_FLIP, LEAST_OVERLAP, LEAST_CORRELATION = 0.15, 0.98, 0.95
+
+ASIDE = re.compile(r"\.(broken|edited)-\d+$")  # io/store/output.py move_aside
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ def verify(
     rendering: Rendering | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Check a run, an asset or a delivered folder, or one file; returns the content of verify.json.
+    """Check a run, a batch, an asset or a delivered folder, or one file; returns the content of verify.json.
 
     Nothing is downloaded: a reader that is not installed gives the outcome "not checked". `rendering` None leaves the
     renders out. Raises InputRefused where `place` is missing or holds no file of ours.
@@ -97,14 +101,18 @@ def verify(
 
 
 def _files(place: Path, out: Path) -> list[Path]:
-    """The files to check; for a run folder its asset, its deliveries, and the markers of its stages."""
+    """The files to check: of a run its asset, its deliveries and the markers of its stages, of a batch those of all its
+    runs and its markers. Folders that were set aside do not belong to a run."""
     if place.is_file():
         return [place]
+    jobs = jobs_of_batch(place)
+    if jobs is not None:
+        return [*(place / SHARDS).glob("*.json"), *(path for job in jobs for path in _files(job, out))]
     folders = [p for p in (place / "asset", place / "delivered") if p.is_dir()] or [place]
     paths = [p for folder in folders for p in sorted(folder.rglob("*")) if p.is_file() and out not in p.parents]
     if folders != [place]:
-        stages = sorted({*place.glob(f"*/{DONE}"), *place.glob(f"work/*/{DONE}")} - set(paths))
-        paths += [p for p in stages if ".broken-" not in p.parent.name]  # folders set aside do not belong to the run
+        paths += sorted({*place.glob(f"*/{DONE}"), *place.glob(f"work/*/{DONE}")} - set(paths))
+    paths = [p for p in paths if not any(ASIDE.search(part) for part in p.relative_to(place).parts[:-1])]
     suffixes = (*READERS, ".json", ".png", ".exr")
     return [p for p in paths if p.suffix.lower() in suffixes]
 

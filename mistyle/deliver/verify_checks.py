@@ -15,6 +15,7 @@ import numpy as np
 
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.core.paths import real_path
+from mistyle.deliver.read_asset import SHARDS, jobs_of_batch
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
 from mistyle.render.external.blender import BLENDER, OPEN_WORKER, blender_command
@@ -49,8 +50,8 @@ def row(file: str, check: str, complaints: Sequence[str], fine: str) -> Check:
 
 
 def listed_files(listing: Path, name: str) -> Check | None:
-    """The sha256 of all files in a list of ours (an asset's, a delivery's, a stage's); None for a JSON file that is not
-    a list."""
+    """The sha256 of all files in a list of ours (of an asset, a delivery, a stage, a batch's job); None for a JSON file
+    that is not a list."""
     from mistyle.io.read import read_json
 
     try:
@@ -63,9 +64,11 @@ def listed_files(listing: Path, name: str) -> Check | None:
         hashes = {str(file): value for file, value in pairs if value is not None}
     except (KeyError, TypeError, AttributeError):
         return None
-    errors = []
+    errors, base = [], listing.parent
+    if base.name == SHARDS and jobs_of_batch(base.parent) is not None:
+        base = base.parent  # a batch's markers name files from its folder
     for file, value in hashes.items():
-        path = listing.parent / file
+        path = base / file
         if not path.is_file():
             errors.append(f"{file} is missing")
         elif sha256_file(path) != value:

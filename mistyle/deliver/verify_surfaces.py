@@ -18,13 +18,15 @@ MAPS = ("map_kd", "map_pr", "map_pm", "norm")
 
 @dataclass(frozen=True)
 class List:
-    """The content of an asset's or a delivery's list: texture sets, and each map's file as (set, map, file)."""
+    """The content of an asset's or a delivery's list: texture sets (`named` by it, or guessed from its files), and each
+    map's file as (set, map, file)."""
 
     path: Path
     asset: str
     sets: tuple[str, ...]
     maps: tuple[tuple[str, str, str], ...]
     models: tuple[str, ...]
+    named: bool
 
 
 def surface_checks(files: Sequence[Path], name: Callable[[Path], str]) -> Iterator[Check]:
@@ -33,8 +35,9 @@ def surface_checks(files: Sequence[Path], name: Callable[[Path], str]) -> Iterat
     whole = {listing.asset: listing.sets for listing in lists if listing.path.name == f"{listing.asset}.json"}
     expected: dict[Path, int] = {}
     for listing in lists:
-        # Lists of older versions name only the sets with remaining files; the asset's own list names all.
-        sets = max(listing.sets, whole.get(listing.asset, ()), key=len)
+        # A list without sets, of an older program, has only those with remaining files; the asset's own list names all.
+        # A list with sets counts as it is: the asset may have changed since that delivery.
+        sets = listing.sets if listing.named else max(listing.sets, whole.get(listing.asset, ()), key=len)
         if listing.maps:
             summary = f"{len(sets)} texture sets, {len(listing.maps)} maps"
             yield row(name(listing.path), CHECK, _list_errors(sets, listing.maps), summary)
@@ -61,7 +64,8 @@ def _list(path: Path) -> List | None:
             maps = [(str(e["set"]), str(e["map"]), f) for e, f in zip(entries, names, strict=True) if "set" in e]
             names_of_sets = tuple(content.get("sets") or dict.fromkeys(s for s, *_ in maps))
         models = tuple(f for f in names if f.endswith((*MODELS, ".mtlx")))
-        return List(path, str(content.get("asset", content["name"])), names_of_sets, tuple(maps), models)
+        named = parts is not None or bool(content.get("sets"))
+        return List(path, str(content.get("asset", content["name"])), names_of_sets, tuple(maps), models, named)
     except (InputRefused, KeyError, TypeError, AttributeError):
         return None  # not a list of ours, or a damaged one, which verify_checks.listed_files reports
 

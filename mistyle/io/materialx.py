@@ -25,6 +25,22 @@ class HeightFile:
 
 
 @dataclass(frozen=True)
+class Transparency:
+    """Opacity and emission of a material, for the formats that hold them.
+
+    alpha     whether the albedo file has the coverage in its alpha
+    opacity   factor of the coverage, 0..1
+    cutoff    coverage threshold: opaque at or above it, else transparent; None: blended
+    emission  radiance, linear Rec.709
+    """
+
+    alpha: bool = False
+    opacity: float = 1.0
+    cutoff: float | None = None
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
 class TexturedMaterial:
     """A material and its images: file names as the document names them. The albedo is sRGB, or linear in `space` (None:
     linear Rec.709). `name` is an identifier (core/names.py); `title` is the user's name for it, or ""."""
@@ -38,6 +54,7 @@ class TexturedMaterial:
     space: ColourSpace | None = None
     title: str = ""
     height: HeightFile | None = None
+    light: Transparency = Transparency()
 
 
 def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:

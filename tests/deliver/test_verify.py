@@ -18,6 +18,7 @@ from mistyle.deliver.asset import write_asset
 from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.deliver.verify import Rendering, compared, file_checks, table, verify
 from mistyle.deliver.verify_surfaces import surface_checks
+from mistyle.io.store.atomic import sha256_file
 from mistyle.render.external.blender import blender_command, find_blender
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
@@ -320,3 +321,55 @@ def test_what_cannot_be_verified_is_refused(tmp_path, run):
     (tmp_path / "mine" / "verify.json").write_text("mine")
     with pytest.raises(UsageError, match="mistyle did not write this file"):
         verify(run, tmp_path / "mine")
+
+
+@pytest.fixture
+def batch(good, tmp_path) -> Path:
+    """A batch folder of two finished jobs, one of which has an edited asset that was set aside."""
+    folder = tmp_path / "batch"
+    (folder / "shards").mkdir(parents=True)
+    (folder / "plan.json").write_text("{}")
+    for name in ("one", "two"):
+        run = Path(shutil.copytree(good, folder / name))
+        files = {p.relative_to(folder).as_posix(): sha256_file(p) for p in (run / "asset").rglob("*") if p.is_file()}
+        (folder / "shards" / f"{name}.json").write_text(json.dumps({"name": name, "key": "k", "files": files}))
+    aside = Path(shutil.copytree(good / "asset", folder / "one" / "asset.edited-1"))
+    (aside / "textures" / "ball_skin_albedo.png").write_bytes(b"painted over")
+    (aside / "done.json").write_text(json.dumps({"key": "k", "files": {"ball.glb": "0" * 64}}))
+    (folder / "shards" / "three.failed.json").write_text(json.dumps({"name": "three", "exit_code": 1}))
+    return folder
+
+
+def test_a_healthy_batch_folder_passes(batch):
+    told = verify(batch)
+    assert told["failed"] == 0, table(told)
+    assert outcomes(told, "shards/one.json", "sha256") == outcomes(told, "shards/two.json", "sha256") == {"passed"}
+    assert outcomes(told, "two/asset/ball.glb", "trimesh") == {"passed"}
+    assert not any("edited" in row["file"] for row in told["checks"])
+    assert verify(batch / "one")["failed"] == 0 and verify(batch / "shards" / "one.json")["failed"] == 0
+    assert verify(batch / "one" / "asset.edited-1")["failed"] > 0  # by its own name it is checked
+
+
+def test_damage_in_a_batch_is_found(batch):
+    (batch / "two" / "asset" / "ball.glb").unlink()
+    told = verify(batch)
+    assert outcomes(told, "shards/two.json") == {"failed"} and outcomes(told, "shards/one.json") == {"passed"}
+
+
+def test_a_batch_is_exported_job_by_job(batch, tmp_path, capsys):
+    assert main(["export", str(batch), "-o", str(tmp_path / "out")]) == 3
+    told = capsys.readouterr().err
+    assert "a batch folder with 2 finished assets" in told and f"for example {batch / 'one'}" in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_earlier_version_may_have_fewer_sets_than_the_asset(run):
+    listing = run / "delivered" / "blender" / "ball.export.json"
+    record = json.loads(listing.read_text())
+    first = record["sets"][0]
+    record["sets"] = [first]
+    record["files"] = [e for e in record["files"] if e.get("set", first) == first and not e["file"].endswith(".glb")]
+    record["files"] = [e for e in record["files"] if not e["file"].endswith((".obj", ".usda", ".usdz", ".mtlx"))]
+    listing.write_text(json.dumps(record))
+    told = {c.file: c for c in surface_checks([run / "asset" / "ball.json", listing], str)}
+    assert told[str(listing)].outcome == "passed" and "1 texture sets" in told[str(listing)].said

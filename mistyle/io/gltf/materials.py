@@ -128,7 +128,7 @@ def _unseen(tree: Tree, index: int) -> list[str]:
         )
     elif emits(entry):
         notes.append(
-            f"Material '{name}' emits light, which painted views omit; it stays in a finished asset and is added "
+            f"Material '{name}' emits light, which painted views omit; it stays in the GLB and is added "
             "to the painting."
         )
     if "KHR_materials_unlit" in entry.get("extensions", {}):
@@ -141,23 +141,17 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
     entry, notes = tree["materials"][index], []
     if sees_through(tree, index):
         mode = "cut out" if entry["alphaMode"] == "MASK" else "blended"
-        notes.append(
-            f"Material '{name}' is {mode} by its alpha, which stays in a finished asset; painted views show it opaque."
-        )
+        notes.append(f"Material '{name}' is {mode} by its alpha, which stays in the GLB; painted views show it opaque.")
     more = sorted(n for n in entry.get("extensions", {}) if n.startswith("KHR_materials_") and n not in _READ)
     drawn = [n for n in more if n in _DRAWN]
     if drawn:
-        notes.append(
-            f"Material '{name}' has {', '.join(drawn)}, which stays in a finished asset; painted views omit it."
-        )
+        notes.append(f"Material '{name}' has {', '.join(drawn)}, which stays in the GLB; painted views omit it.")
     with_maps = [n for n in drawn if any(k.endswith("Texture") for k in extension(entry["extensions"], n))]
     if any(n != "KHR_materials_specular" for n in with_maps):
         notes.append(f"Material '{name}': the factors of {' and '.join(with_maps)} were read, not the textures.")
     more = [n for n in more if n not in _DRAWN]
     if more:
-        notes.append(
-            f"Material '{name}' has {', '.join(more)}, which stays in a finished asset; renders here leave it out."
-        )
+        notes.append(f"Material '{name}' has {', '.join(more)}, which stays in the GLB; renders here leave it out.")
     if GLOSSY in entry.get("extensions", {}):
         notes.append(
             f"Material '{name}' ({GLOSSY}): diffuse colour and glossiness are painted; its specular colour is drawn, "

@@ -14,6 +14,7 @@ from mistyle.io.gltf.glb import Buffers, values
 from mistyle.io.gltf.infos import base_set, sees_through, wanted_sets
 from mistyle.io.gltf.materials import read_material
 from mistyle.io.gltf.pose import INSTANCING, instances, joint_matrices, mirrors, morphed, posed, skinned, turned
+from mistyle.io.gltf.variants import variant_notes
 from mistyle.io.gltf.vertices import triangles
 from mistyle.io.images.read import Budget
 from mistyle.io.meshes.parsed_mesh import Corners, Indexed, Raw, RawMaterial
@@ -77,6 +78,7 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
     kind = np.min_scalar_type(-len(used))
     material = np.repeat(np.array([used.index(p.material) for p in pieces], kind), counts)
     materials = _materials(tree, buffers, path, pieces, used, notes)
+    notes += variant_notes(tree, set(used))
     starts = np.cumsum([0, *counts])
     primitives = tuple(
         Primitive(p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex)
@@ -160,11 +162,11 @@ def _pieces(
         if "skin" in entry:
             joints, root = joint_matrices(tree, buffers, entry["skin"], world, path)
             matrix = joints[root]
-            notes.append("A skinned mesh was read in the pose of its joints; skin and animations stay as they are.")
+            notes.append("A skinned mesh was read in the pose of its joints; skin and animations stay in the GLB.")
         if not np.isfinite(matrix if joints is None else joints).all():
             raise refuse(path, f"node {node} with a transform that is not finite", "finite numbers", AGAIN)
         if _flattened(matrix):
-            notes.append("Nodes that are scaled to a point or a line were left out; they stay in a finished asset.")
+            notes.append("Nodes that are scaled to a point or a line were left out; they stay in the GLB.")
             continue
         for instance in _instances(tree, buffers, entry, min(max_faces, MAX_INSTANCED) - faces, notes):
             placed: dict[str, _Place] = {}
@@ -331,7 +333,7 @@ def _scene_nodes(tree: Tree, notes: list[str]) -> list[int]:
             continue
         seen.add(node)
         if _hidden(nodes[node]):
-            notes.append("Hidden nodes (KHR_node_visibility) were left out; they stay in a finished asset.")
+            notes.append("Hidden nodes (KHR_node_visibility) were left out; they stay in the GLB.")
             continue
         order.append(node)
         stack.extend(reversed(nodes[node].get("children", [])))

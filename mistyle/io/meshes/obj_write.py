@@ -52,6 +52,7 @@ def _materials(looks: Sequence[TexturedMaterial]) -> str:
         lines += [
             f"newmtl {look.title or look.name}",
             "Kd 1 1 1",
+            *([f"Ke {' '.join(f'{c:.6g}' for c in look.light.emission)}"] if any(look.light.emission) else []),
             "Pr 1",
             "Pm 1",
             f"map_Kd {look.albedo}",

@@ -21,7 +21,6 @@ from mistyle.core.errors import UsageError
 from mistyle.io.store.atomic import (
     COUNTER,
     DONE,
-    LOCK,
     atomic_folder,
     atomic_write,
     clean_leftovers,
@@ -231,7 +230,7 @@ def _merge(temporary: Path, root: Path, by: str, new: Mapping[str, str], stays: 
     before = read_written(root)
     both = {name: Entry(by, (*_hashes(before, name), value)) for name, value in new.items()}
     _write_record(root, Written({**before.files, **both}, before.folders))
-    for name in new:
+    for name in sorted(new, key=lambda name: name.endswith(".json")):  # lists last: they name only present files
         move(temporary / name, root / name)
     obsolete = [name for name, entry in before.files.items() if entry.by == by and name not in new and not stays(name)]
     for name in obsolete:
@@ -370,12 +369,15 @@ def _empty_folders(folder: Path) -> bool:
 
 
 def _wholly(root: Path, by: str) -> bool:
-    """Whether a folder holds only this writer's unchanged files, and may be swapped."""
+    """Whether a folder holds only this writer's unchanged files, and may be swapped.
+
+    A folder with a lock is not: other processes wait for the lock inside it.
+    """
     written = read_written(root)
     if written is NOTHING or written.folders or any(entry.by != by for entry in written.files.values()):
         return False
     unchanged = all(ours(root, name, written) for name in written.files if os.path.lexists(root / name))
-    return unchanged and _only(root, {RECORD, LOCK, *written.files})
+    return unchanged and _only(root, {RECORD, *written.files})
 
 
 def real(path: Path) -> Path:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.core.mesh import Mesh, local_origin
-from mistyle.io.materialx import TexturedMaterial
+from mistyle.io.materialx import TexturedMaterial, Transparency
 
 NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "UsdValidation", "Vt")
 UTF8 = 1 << 11  # zip's flag for a name in UTF-8; without it readers assume code page 437
@@ -47,6 +47,7 @@ def write_usd(
     looks: Sequence[TexturedMaterial],
     *,
     metres_per_unit: float = 1.0,
+    double_sided: bool = False,
 ) -> None:
     """Write `path` (.usda): default prim `name` of kind component with one Mesh, a GeomSubset per part.
 
@@ -74,6 +75,8 @@ def write_usd(
     shape.CreateFaceVertexCountsAttr(pxr.Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
     shape.CreateFaceVertexIndicesAttr(pxr.Vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
     shape.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
+    if double_sided:
+        shape.CreateDoubleSidedAttr(True)
     shape.CreateExtentAttr(
         pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*points.min(axis=0).tolist()), pxr.Gf.Vec3f(*points.max(axis=0).tolist())])
     )
@@ -131,15 +134,30 @@ def define_material(pxr: Any, stage: Any, place: str, look: TexturedMaterial, pr
             scale, middle = look.height.scale, look.height.middle
             texture.CreateInput("scale", pxr.Sdf.ValueTypeNames.Float4).Set((scale,) * 4)
             texture.CreateInput("bias", pxr.Sdf.ValueTypeNames.Float4).Set((-middle * scale,) * 4)
+        if name == "diffuseColor" and look.light.alpha:
+            texture.CreateInput("scale", pxr.Sdf.ValueTypeNames.Float4).Set((1, 1, 1, look.light.opacity))
+            coverage = texture.CreateOutput("a", pxr.Sdf.ValueTypeNames.Float)
+            surface.CreateInput("opacity", pxr.Sdf.ValueTypeNames.Float).ConnectToSource(coverage)
         output = texture.CreateOutput(
             channel, pxr.Sdf.ValueTypeNames.Float3 if len(channel) > 1 else pxr.Sdf.ValueTypeNames.Float
         )
         surface.CreateInput(name, kind).ConnectToSource(output)
+    _set_light(pxr, surface, look.light)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", pxr.Sdf.ValueTypeNames.Token))
     if look.height is not None:
         moves = surface.CreateOutput("displacement", pxr.Sdf.ValueTypeNames.Token)
         material.CreateDisplacementOutput().ConnectToSource(moves)
     return material
+
+
+def _set_light(pxr: Any, surface: Any, light: Transparency) -> None:
+    """Opacity without a texture, the threshold of a cut-out material, and emission."""
+    if light.opacity < 1 and not light.alpha:
+        surface.CreateInput("opacity", pxr.Sdf.ValueTypeNames.Float).Set(light.opacity)
+    if light.cutoff is not None and (light.alpha or light.opacity < 1):
+        surface.CreateInput("opacityThreshold", pxr.Sdf.ValueTypeNames.Float).Set(light.cutoff)
+    if any(light.emission):
+        surface.CreateInput("emissiveColor", pxr.Sdf.ValueTypeNames.Color3f).Set(light.emission)
 
 
 def _titled(schema: Any, title: str) -> None:
