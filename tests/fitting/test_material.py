@@ -178,7 +178,8 @@ def test_cameras_that_do_not_fit_the_mesh_are_said(shots, tmp_path, capsys, monk
     report_placement(wrong, progress)
     (note,) = progress.notes
     assert note.startswith("Warning: the cameras do not fit the mesh in ") and "less than 0.8" in note
-    assert ("--align" in note) == (not align) and "--refine-poses" in note
+    assert ("use --align" in note) == ("file has Z up" in note) == (not align)
+    assert ("--refine-poses" in note) == align
     assert wrong.figures["outline_overlap_least"] == min(wrong.overlap) < 0.8
     printed = capsys.readouterr().err
     assert note in printed and f"c00_0 {wrong.overlap[0]:.2f}, " in printed

@@ -67,6 +67,19 @@ def test_outlines_tell_right_frames_from_wrong_ones():
         assert "--align" in camera_advice(settings, found)
 
 
+def test_a_mesh_with_z_up_is_named_wherever_the_origin_of_its_file_lies():
+    """The file's axes turn about its origin, not about the mesh."""
+    mesh, origin = wedge(), np.array([0.5, -0.4, 0.7])
+    seen = [orbit(100.0 * k, 25, distance=4.0, fov=30.0, size=(96, 120)) for k in range(3)]
+    masks = [gbuffer(tracer(mesh), camera).mask for camera in seen]
+    about = similarity(1.0, TURN[:3, :3], origin - TURN[:3, :3] @ origin)
+    cameras = [moved_camera(camera, about) for camera in seen]
+    found = check_outlines(mesh, cameras, masks, origin=origin)
+    (note,) = overlap_notes(["v0", "v1", "v2"], found, 0.8, camera_advice(ReferenceSettings(), found))
+    assert "turned by 90 degrees about X" in note and "The mesh's file has Z up" in note and "--align" in note
+    assert "Z up" not in camera_advice(ReferenceSettings(), check_outlines(mesh, cameras, masks))
+
+
 def test_outlines_that_do_not_show_a_turn_are_said():
     """A cube looks the same under the turns that take one convention for another."""
     cube = wedge()

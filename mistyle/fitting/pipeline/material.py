@@ -266,7 +266,8 @@ def place(
         captures = replace(captures, cameras=refined.cameras)
         before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
         figures |= {"pose_px_before": before, "pose_px_after": after}
-    overlaps = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
+    origin = asset.source.work_from_user[:3, 3]
+    overlaps = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done), origin)
     ours = camera_space(job.references) == "working" and not chosen.align
     names = [camera.name for camera in captures.cameras]
     warnings = overlap_notes(names, overlaps, chosen.overlap, camera_advice(chosen, overlaps), trusted=ours)

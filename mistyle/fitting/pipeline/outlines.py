@@ -14,11 +14,13 @@ from mistyle.jobs.progress import Progress
 
 def camera_advice(chosen: ReferenceSettings, found: Any) -> str:
     """The advice for cameras whose `found` outlines do not fit, without the options already in use."""
-    from mistyle.solver.cameras.outline_check import Z_UP
+    from mistyle.solver.cameras.outline_check import MESH_Z_UP, Z_UP
 
     best = max(found.turned, key=lambda name: found.turned[name], default=None)
     if chosen.up == "y" and best == Z_UP and found.turned[best] >= chosen.overlap:
         return "Blender's world has Z up and a glTF file Y up: --set references.up=z turns such cameras and lights."
+    if chosen.up == "y" and not chosen.align and best == MESH_Z_UP and found.turned[best] >= chosen.overlap:
+        return "The mesh's file has Z up and the cameras' world Y up: use --align, or write the mesh with Y up."
     options = [f"--{name.replace('_', '-')}" for name in ("align", "refine_poses") if not getattr(chosen, name)]
     start = f"Try {' and '.join(options)}; check" if options else "Check"
     return (

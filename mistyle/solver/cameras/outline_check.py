@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from mistyle.core.camera import Camera
@@ -22,10 +22,12 @@ from mistyle.solver.cameras.align import shrunk
 
 SIDE = 160  # pixels of the longer side: resolves some 1 % of the overlap
 FEW = 6  # pictures that are also compared under rotated cameras
+CENTRE = np.zeros(3)  # of the mesh in working space
 ALIKE = 0.02  # insignificant difference of mean overlaps
 # Frames that conventions confuse, as rotations of the cameras about X, degrees.
 Z_UP = "by -90 degrees about X"  # turns cameras of a world with Z up
-TURNS = {"by 90 degrees about X": 90.0, Z_UP: -90.0, "by 180 degrees about X": 180.0}
+MESH_Z_UP = "by 90 degrees about X"  # turns cameras of a world with Y up to a mesh with Z up
+TURNS = {MESH_Z_UP: 90.0, Z_UP: -90.0, "by 180 degrees about X": 180.0}
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,8 @@ class Outlines:
 
     overlap  0..1 of each picture; NaN where it has no outline
     base     the mean over the few pictures that are also compared under rotated cameras; NaN if there are none
-    turned   the same mean with all cameras rotated about the mesh, by the names of TURNS
+    turned   the same mean with all cameras rotated about the mesh or the origin of its file, whichever fits better, by
+             the names of TURNS
     """
 
     overlap: tuple[float, ...]
@@ -47,9 +50,10 @@ def check_outlines(
     cameras: Sequence[Camera],
     outlines: Iterable[Bool[np.ndarray, "h w"] | None],
     progress: Callable[[float], None] = lambda done: None,
+    origin: Float[np.ndarray, "3"] = CENTRE,
 ) -> Outlines:
     """The overlaps of the mesh (working space) with the outlines, each of its camera's size and read one at a time.
-    None, a full mask and an empty mask count as no outline."""
+    None, a full mask and an empty mask count as no outline. `origin` is that of the mesh's file."""
     traced = tracer(mesh)
 
     def drawn(camera: Camera) -> np.ndarray:
@@ -66,8 +70,9 @@ def check_outlines(
     few = [seen[k] for k in evenly(len(seen), FEW)]
 
     def mean(degrees: float) -> float:
-        turn = similarity(1.0, Rotation.from_euler("x", degrees, degrees=True).as_matrix(), np.zeros(3))
-        return float(np.mean([overlap(drawn(moved_camera(camera, turn)), mask) for camera, mask in few]))
+        turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
+        turns = [similarity(1.0, turn, pivot - turn @ pivot) for pivot in (CENTRE, origin)[: 2 if degrees else 1]]
+        return float(max(np.mean([overlap(drawn(moved_camera(c, t)), mask) for c, mask in few]) for t in turns))
 
     if not few:
         return Outlines(tuple(overlaps), float("nan"), {})
