@@ -18,7 +18,17 @@ from typing import Any
 
 from mistyle.batch import engines
 from mistyle.batch.jobs_file import MOST_LISTED, Record, read_file, resolve, source_of
-from mistyle.batch.plan import PLAN, SHARDS, BatchPlan, check_moved, check_names, inputs_of, read_plan, write_plan
+from mistyle.batch.plan import (
+    PLAN,
+    SHARDS,
+    BatchPlan,
+    check_alone,
+    check_moved,
+    check_names,
+    inputs_of,
+    read_plan,
+    write_plan,
+)
 from mistyle.batch.shard import claim_batch, finished, job_of, marker, outcome
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.names import folded
@@ -49,6 +59,7 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
     is_plan = jobs.name == PLAN or (jobs.is_dir() and (jobs / PLAN).is_file())
     if is_plan:
         plan = read_plan(jobs)
+        check_alone(jobs, plan)
         if out is not None and os.path.realpath(out) != os.path.realpath(plan.out):
             raise UsageError(
                 f"{jobs}: this plan writes to {plan.out}; leave out -o, or write a new plan from the jobs file"

@@ -18,7 +18,7 @@ from mistyle.batch.jobs_file import Record
 from mistyle.batch.names import why_not
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.names import folded
-from mistyle.io.store.output import write_file
+from mistyle.io.store.output import RECORD, write_file
 from mistyle.io.store.trusted_json import read_own
 from mistyle.jobs.settings import merge, validate
 
@@ -61,7 +61,8 @@ def write_plan(plan: BatchPlan) -> Path:
 def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> BatchPlan:
     """A plan (the file or its folder), with its paths mapped to this machine. Raises InputRefused or UsageError.
 
-    Where no map decides the batch's folder, it is the one in which the plan lies.
+    Where no map decides the batch's folder, it is the one in which the plan lies, if that is a batch's folder. A plan
+    alone, as a queue copies it, writes where it was made for.
     """
     path = path / PLAN if path.is_dir() else path
     try:
@@ -80,18 +81,10 @@ def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> BatchPlan:
 
 
 def _where_it_lies(plan: BatchPlan, here: Path) -> BatchPlan:
-    """The plan of the batch folder `here`, which may have been moved: paths inside the old folder follow.
-
-    UsageError for a copy of the plan alone: its finished jobs lie elsewhere.
-    """
+    """The plan of the folder `here`; if that is a batch's own, which was moved, paths inside the old folder follow."""
     old = plan.out
-    if os.path.realpath(old) == os.path.realpath(here) or (old.exists() and old.samefile(here)):
+    if os.path.realpath(old) == os.path.realpath(here) or (old.exists() and old.samefile(here)) or _alone(here):
         return plan
-    if not (here / SHARDS).is_dir() and (old / PLAN).is_file():
-        raise UsageError(
-            f"{here / PLAN}: this is a copy of a plan whose batch is in {old}, not in {here}. Resume it there "
-            f"(mistyle batch {shlex.quote(str(old))}), or copy its whole folder"
-        )
     spellings = dict.fromkeys((str(old), os.path.normpath(old), os.path.realpath(old)))
     maps = [(spelling, str(here)) for spelling in spellings]
 
@@ -105,6 +98,21 @@ def _where_it_lies(plan: BatchPlan, here: Path) -> BatchPlan:
         return text if moved == plain else moved
 
     return replace(plan, out=here, jobs=tuple(with_paths(job, follow) for job in plan.jobs), moved_from=old)
+
+
+def _alone(here: Path) -> bool:
+    """Whether a folder has nothing else of a batch than a copy of its plan."""
+    return not (here / SHARDS).is_dir() and not (here / RECORD).is_file()
+
+
+def check_alone(path: Path, plan: BatchPlan) -> None:
+    """UsageError where `path` is a copy of a plan alone: its finished jobs lie elsewhere."""
+    here = path.absolute() if path.is_dir() else path.absolute().parent
+    if os.path.realpath(here) != os.path.realpath(plan.out) and (plan.out / PLAN).is_file() and _alone(here):
+        raise UsageError(
+            f"{here / PLAN}: this is a copy of a plan whose batch is in {plan.out}, not in {here}. Resume it there "
+            f"(mistyle batch {shlex.quote(str(plan.out))}), or copy its whole folder"
+        )
 
 
 def check_names(plan: BatchPlan) -> None:

@@ -63,6 +63,7 @@ def test_what_cannot_follow_is_refused_with_both_places(batch, props):
     with pytest.raises(UsageError, match="copy of a plan") as refused:
         planned(alone, None, ONE)
     assert str(batch) in str(refused.value) and str(alone) in str(refused.value)
+    assert read_plan(alone / PLAN).out == batch, "a shard whose queue copied the plan writes into the batch"
     new = batch.rename(batch.with_name("new"))
     props.rename(props.with_name("elsewhere"))
     with pytest.raises(InputRefused, match="3 of its inputs are not") as lost:

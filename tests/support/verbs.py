@@ -146,7 +146,8 @@ VERBS = {
 
 
 def planned(inputs: Path, out: Path) -> Path:
-    """A plan of one job, as `mistyle batch` resolves it, that lies beside `out` and works there."""
+    """A plan of one job, as `mistyle batch` resolves it, alone in a folder beside `out`; it works in `out`."""
+    import tempfile
     from dataclasses import replace
 
     from mistyle.batch.pipeline import Choices, planned
@@ -155,7 +156,9 @@ def planned(inputs: Path, out: Path) -> Path:
     place = out.parent / f"plan of {out.name}"
     if not (place / "plan.json").is_file():
         plan = planned(inputs / "jobs.toml", out, Choices(threads=2))
-        told = json.loads(write_plan(replace(plan, out=place)).read_text())
+        with tempfile.TemporaryDirectory(dir=out.parent) as scratch:
+            told = json.loads(write_plan(replace(plan, out=Path(scratch))).read_text())
+        place.mkdir()
         (place / "plan.json").write_text(json.dumps(told | {"out": str(out)}))
     return place / "plan.json"
 
