@@ -45,6 +45,14 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
+@pytest.fixture
+def props(tmp_path) -> Path:
+    """A folder with two meshes and two pictures, for batches."""
+    from batch_parts import write_props
+
+    return write_props(tmp_path / "props")
+
+
 @pytest.fixture(scope="session")
 def verb_inputs(tmp_path_factory) -> Path:
     """A folder with what every verb that writes can be given (tests/support/verbs.py); not to be changed."""

@@ -4,6 +4,9 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
 from mistyle.batch import engines
 from mistyle.batch.shard import key_of, marker
 from mistyle.io.store.atomic import sha256_file
@@ -12,6 +15,19 @@ from mistyle.io.store.output import keep_folder
 CUBE = """v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1
 f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 4 7 3\nf 4 8 7\nf 1 5 8\nf 1 8 4\nf 2 3 7\nf 2 7 6
 """
+
+
+def write_props(folder: Path) -> Path:
+    """Two meshes and two pictures."""
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "styles").mkdir()
+    for name in ("cube", "box"):
+        (folder / "meshes" / f"{name}.obj").write_text(CUBE)
+    rng = np.random.default_rng(0)
+    for name in ("wave.png", "ink.jpg"):
+        pixels = (rng.random((12, 16, 3)) * 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+        Image.fromarray(pixels).save(folder / "styles" / name)
+    return folder
 
 
 def jobs_file(folder: Path, text: str, name: str = "jobs.toml") -> Path:
