@@ -33,9 +33,8 @@ class BatchPlan:
     """The jobs of a batch, and the parent of their run folders.
 
     `left_out` are sentences on files of a folder that take no part. plan.json does not hold the last three: `overwrite`
-    allows this call to replace files in it that are not mistyle's,
-    `moved_from` is the folder in which the plan was written, where that is another one, and `notes` are due before
-    anything runs.
+    allows this call to replace files that are not mistyle's, `moved_from` is the folder in which the plan was written,
+    where that is another one, and `notes` are due before anything runs.
     """
 
     out: Path

@@ -291,14 +291,19 @@ def test_blender_folders(tmp_path):
             assert np.abs(new.world_from_cam - old.world_from_cam).max() < 1e-12
 
 
-def test_pictures_of_one_name_in_several_folders(tmp_path):
-    nerf(tmp_path, [grey(0.25), grey(0.75)])
-    tree = json.loads((tmp_path / "transforms.json").read_text())
+def two_folders(place):
+    """A capture of two pictures of one name, each in a folder of its own."""
+    nerf(place, [grey(0.25), grey(0.75)])
+    tree = json.loads((place / "transforms.json").read_text())
     for k, frame in enumerate(tree["frames"]):
         frame["file_path"] = f"cam{k}/0001.png"
-        (tmp_path / f"cam{k}").mkdir()
-        (tmp_path / "images" / f"v{k}.png").rename(tmp_path / f"cam{k}" / "0001.png")
-    (tmp_path / "transforms.json").write_text(json.dumps(tree))
+        (place / f"cam{k}").mkdir()
+        (place / "images" / f"v{k}.png").rename(place / f"cam{k}" / "0001.png")
+    (place / "transforms.json").write_text(json.dumps(tree))
+
+
+def test_pictures_of_one_name_in_several_folders(tmp_path):
+    two_folders(tmp_path)
     captures = read_captures(tmp_path)
     assert [c.name for c in captures.cameras] == ["cam0_0001", "cam1_0001"]
     assert captures.load(0)[0].mean() < captures.load(1)[0].mean()
@@ -308,13 +313,7 @@ def test_pictures_of_one_name_in_several_folders(tmp_path):
     "spelling", ["cam{}/0001.png", "cam{}/0001", "./cam{}/0001.png", "cam{}\\0001.PNG", "cam{}_0001"]
 )
 def test_lights_and_exposures_by_the_camera_files_names(tmp_path, spelling):
-    nerf(tmp_path, [grey(0.25), grey(0.75)])
-    tree = json.loads((tmp_path / "transforms.json").read_text())
-    for k, frame in enumerate(tree["frames"]):
-        frame["file_path"] = f"cam{k}/0001.png"
-        (tmp_path / f"cam{k}").mkdir()
-        (tmp_path / "images" / f"v{k}.png").rename(tmp_path / f"cam{k}" / "0001.png")
-    (tmp_path / "transforms.json").write_text(json.dumps(tree))
+    two_folders(tmp_path)
     rigs = [[{"type": "ambient", "radiance": [k + 1.0] * 3}] for k in range(2)]
     lights = tmp_path / "lights.json"
     lights.write_text(json.dumps({"lights": [], "views": {spelling.format(k): rigs[k] for k in range(2)}}))
