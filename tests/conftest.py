@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS)
-from browser import NO_BROWSER
-from helpers import NO_DATA
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 from mistyle.setup import environment
+from tests.support.browser import NO_BROWSER
+from tests.support.helpers import NO_DATA
 
 # Skips that CI accepts, by the beginning of their reason, and why. Where the environment variable CI is set, any
 # other skip fails the run: a test that never runs proves nothing.
@@ -48,7 +48,7 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def props(tmp_path) -> Path:
     """A folder with two meshes and two pictures, for batches."""
-    from batch_parts import write_props
+    from tests.support.batch_parts import write_props
 
     return write_props(tmp_path / "props")
 
@@ -56,7 +56,7 @@ def props(tmp_path) -> Path:
 @pytest.fixture(scope="session")
 def verb_inputs(tmp_path_factory) -> Path:
     """A folder with what every verb that writes can be given (tests/support/verbs.py); not to be changed."""
-    from verbs import write_inputs
+    from tests.support.verbs import write_inputs
 
     folder = tmp_path_factory.mktemp("verbs") / "inputs"
     write_inputs(folder)

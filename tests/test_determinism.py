@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOT
+
+from tests.support.helpers import ROOT
 
 # Without gradients, or with gradients that are gathers: no order of additions is left to the threads.
 SAME_BYTES = (
@@ -52,9 +53,7 @@ MALLOC_FILL = "MALLOC_PERTURB_"  # glibc: the byte whose complement fresh memory
 def start(folder: Path, out: Path, budget: str = "0", **environment: str) -> subprocess.Popen[bytes]:
     folder.mkdir()
     child = ROOT / "tests" / "support" / "determinism_child.py"
-    # The child imports other tests, as this process can.
-    shared = [path for path in sys.path if path.startswith(str(ROOT / "tests"))]
-    paths = os.pathsep.join([str(ROOT), *shared, os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     with open(folder / SAID, "wb") as said:
         return subprocess.Popen(
             [sys.executable, str(child), str(out), "2", budget],
@@ -105,7 +104,7 @@ def test_within_its_tolerance(twice, stage):
 
 def test_a_difference_would_show(twice, tmp_path):
     """One changed bit of one array is another digest, and so is another type or shape."""
-    from determinism_child import digest
+    from tests.support.determinism_child import digest
 
     values = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
     changed = values.copy()

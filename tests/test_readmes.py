@@ -19,13 +19,13 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from helpers import ROOT
 
 from mistyle.cli.main import parser
 from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.fitting.settings.scene import SceneSettings
 from mistyle.jobs.settings import known_keys
 from mistyle.stylization.settings import Settings
+from tests.support.helpers import ROOT
 
 LANGUAGES = {"shell", "python", "toml", "json", "text"}
 MARK = "<!-- run -->"

@@ -11,12 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import ROOT
-from notebooks import execute
-from test_recover import DIRECT, QUICK, strong_maps
-from test_scene_fit import CAMERAS, COLOUR, flat, references
-from test_seam import SIZES, crop, random_maps, sphere, torus
-from verbs import SQUARE
 
 import mistyle
 from mistyle import api
@@ -26,6 +20,12 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.emitters import emitters
+from tests.render.deferred.test_seam import SIZES, crop, random_maps, sphere, torus
+from tests.solver.test_recover import DIRECT, QUICK, strong_maps
+from tests.solver.test_scene_fit import CAMERAS, COLOUR, flat, references
+from tests.support.helpers import ROOT
+from tests.support.notebooks import execute
+from tests.support.verbs import SQUARE
 
 KEY = mistyle.Directional((-0.5, -0.5, -0.7071), (2.0, 1.5, 1.0), "camera")
 LAMP = mistyle.Point((-2.5, 1.5, 2.0), (12.0, 9.0, 6.0))

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import data
 
 from mistyle.atlas import bake as stage
 from mistyle.atlas.bake import Backprojection, backproject, bake, fill, pure_colours
@@ -17,6 +16,7 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
+from tests.support.helpers import data
 
 SETTINGS = BakeSettings()
 Paint = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (points (n 3), uvs (n 2)) -> rgb (n 3)

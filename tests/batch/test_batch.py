@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from batch_parts import CUBE, done_by_hand, jobs_file, stand_in
 from PIL import Image
 
 from mistyle.batch import engines
@@ -19,6 +18,7 @@ from mistyle.batch.pipeline import Choices, describe, describe_dry_run, dry_run,
 from mistyle.batch.plan import PLAN, indices, path_maps, read_plan, replaced, write_plan
 from mistyle.batch.shard import finished, marker, outcome
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from tests.support.batch_parts import CUBE, done_by_hand, jobs_file, stand_in
 
 
 def test_a_folder_is_a_grid_of_what_lies_in_it(props):

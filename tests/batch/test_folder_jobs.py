@@ -4,13 +4,13 @@ import json
 import shutil
 
 import pytest
-from batch_parts import CUBE, stand_in
 
 from mistyle.batch import folder_jobs as module
 from mistyle.batch.folder_jobs import folder_jobs
 from mistyle.batch.pipeline import Choices, opening_notes, planned, run_batch
 from mistyle.cli.main import main
 from mistyle.core.errors import InputRefused
+from tests.support.batch_parts import CUBE, stand_in
 
 ONE = Choices(threads=1)
 

@@ -4,11 +4,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from batch_parts import done_by_hand, jobs_file, stand_in
 
 from mistyle.batch.pipeline import Choices, opening_notes, planned, run_batch
 from mistyle.batch.plan import PLAN, read_plan, write_plan
 from mistyle.core.errors import InputRefused, UsageError
+from tests.support.batch_parts import done_by_hand, jobs_file, stand_in
 
 ONE = Choices(threads=1)
 NOT_RUN = "import sys; sys.exit(9)"

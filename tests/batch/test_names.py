@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from batch_parts import CUBE, done_by_hand, jobs_file, stand_in
 
 from mistyle.batch.names import OWN, JobSource, job_names
 from mistyle.batch.page import write_page
@@ -16,6 +15,7 @@ from mistyle.batch.plan import PLAN, SHARDS, write_plan
 from mistyle.cli.main import main
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, is_safe
+from tests.support.batch_parts import CUBE, done_by_hand, jobs_file, stand_in
 
 ONE = Choices(threads=1)
 BASE = Path("/show")

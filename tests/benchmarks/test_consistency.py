@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_metrics import noise, plane_view
 
 from benchmarks.consistency import metrics as consistency
 from mistyle.core.image import gaussian
 from mistyle.measure import metrics
 from mistyle.measure.overlap import overlap
+from tests.measure.test_metrics import noise, plane_view
 
 GREY, LIGHT = (np.full((96, 96, 3), v, np.float32) for v in (0.4, 0.5))
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_metrics import noise, plane_view
 
 from benchmarks.consistency import judge as consistency_judge
 from benchmarks.consistency import peer as consistency_peer
@@ -14,6 +13,7 @@ from benchmarks.consistency import scene as consistency_scene
 from mistyle.core.asset import Picture
 from mistyle.stylization.settings import Settings
 from mistyle.stylization.surface.exemplar import exemplar as styles
+from tests.measure.test_metrics import noise, plane_view
 
 # Instead of EbSynth: checks its arguments as EbSynth would, and answers with the target's colour guide.
 PROGRAM = """#!{python}

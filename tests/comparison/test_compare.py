@@ -11,7 +11,6 @@ from xml.etree import ElementTree
 import numpy as np
 import OpenEXR
 import pytest
-from helpers import data
 from PIL import Image
 
 from mistyle.cli.main import main
@@ -19,6 +18,7 @@ from mistyle.comparison.frames import matches
 from mistyle.comparison.limits import Limit, broken
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.read import read_frame
+from tests.support.helpers import data
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FAST = ["--metrics", "psnr,relmse,rmse,mae"]

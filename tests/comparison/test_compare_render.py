@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import data
 
 from mistyle.cli.main import main
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
@@ -18,6 +17,7 @@ from mistyle.render.external.render_files import Subject, write_asset_glb
 from mistyle.render.external.renderers import left_out, renderer, shots, subject
 from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.mitsuba.draw import gbuffer
+from tests.support.helpers import data
 
 CORNER = """<scene version="3.9.0">
   <integrator type="path"><integer name="max_depth" value="4"/></integrator>

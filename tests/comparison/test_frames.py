@@ -5,10 +5,10 @@ import OpenEXR
 import pytest
 import tifffile
 from PIL import Image
-from test_compare import picture, run, save
 
 from mistyle.comparison.frames import matches
 from mistyle.io.read import read_picture
+from tests.comparison.test_compare import picture, run, save
 
 GATE = ["--metrics", "psnr,differing", "--min", "psnr=60"]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOT
 
 from mistyle.core.drjit_arrays import ALIGNMENT, LANES, aligned, whole
+from tests.support.helpers import ROOT
 
 # An array that ends with its page, behind which nothing may be read.
 AT_THE_END_OF_A_PAGE = """

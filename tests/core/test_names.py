@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from gltf_cases import bumpy_sphere, material, no_texels, quarters
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from mistyle.batch.jobs_file import BatchJob, _names
+from mistyle.batch.names import JobSource, job_names
 from mistyle.cli.main import main
 from mistyle.cli.options import asset_name
 from mistyle.core import names
@@ -33,6 +32,7 @@ from mistyle.io.images.textures import part_stems
 from mistyle.io.store import atomic
 from mistyle.io.usd.write import library
 from mistyle.jobs.deliver_settings import TEXTURES
+from tests.support.gltf_cases import bumpy_sphere, material, no_texels, quarters
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
 LONG = "木" * 82
@@ -274,7 +274,8 @@ def test_names_of_assets_and_jobs_are_file_names_before_the_work_begins(tmp_path
     assert main([*command, "--name", "木" * 83]) == 2
     assert "249 bytes of UTF-8, expected" in capsys.readouterr().err and not (tmp_path / "out").exists()
     called = [LONG, LONG, "Chair", "chair", "my chair", "con", "con"]
-    jobs = [BatchJob(mesh=Path(f"{k}.obj"), style=Path("s.png"), name=name) for k, name in enumerate(called)]
-    made = _names(jobs)
+    made = job_names(
+        [JobSource(Path(f"{k}.obj"), Path("s.png"), chosen=name) for k, name in enumerate(called)], tmp_path
+    )
     assert len({n.lower() for n in made}) == len(made) and all(names.is_safe(n) for n in made)
     assert made[2:5] == ["Chair", "chair-2", "my-chair"]

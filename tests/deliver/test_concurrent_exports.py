@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gltf_cases import no_texels, quad, quarters
 
 from mistyle.core.errors import UsageError
 from mistyle.deliver.asset import write_asset
 from mistyle.deliver.exclusive import hold
 from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.io.store.atomic import LOCK, sha256_file
+from tests.support.gltf_cases import no_texels, quad, quarters
 
 EXPORT = "import sys; from mistyle.cli.main import main; sys.exit(main(['export', *sys.argv[1:]]))"
 HOLD = """

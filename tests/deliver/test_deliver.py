@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from gltf_cases import bumpy_sphere, no_texels, quad, quarters
 from PIL import Image
 
 from mistyle.batch.jobs_file import Record
@@ -26,6 +25,7 @@ from mistyle.io.store import output
 from mistyle.jobs.deliver_settings import FORMATS
 from mistyle.jobs.progress import Progress
 from mistyle.stylization.settings import Settings, resolve
+from tests.support.gltf_cases import bumpy_sphere, no_texels, quad, quarters
 
 OCCLUSION = np.linspace(0.2, 1, 256, dtype=np.float32).reshape(16, 16)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from gltf_cases import bumpy_sphere, from_gltf, glb_parts, no_texels, quad, quarters, strange_gltf
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.errors import UsageError
@@ -19,6 +18,7 @@ from mistyle.io.gltf.write import write_glb
 from mistyle.io.images import textures
 from mistyle.io.images.write import encode_png
 from mistyle.io.read_mesh import read_mesh
+from tests.support.gltf_cases import bumpy_sphere, from_gltf, glb_parts, no_texels, quad, quarters, strange_gltf
 
 OPEN = np.ones((16, 16), np.float32)
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gltf_cases import from_gltf, glb_parts, quarters, strange_gltf
 
 from mistyle.atlas.texels import rasterise
 from mistyle.cli.main import main
@@ -14,6 +13,7 @@ from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.deliver.losses import LABELS, LACKS, MESH, SURFACE, losses, mesh_features
 from mistyle.io.gltf.glb import Builder
 from mistyle.io.gltf.variants import variant_notes, variants
+from tests.support.gltf_cases import from_gltf, glb_parts, quarters, strange_gltf
 
 FORMATS = ["glb", "usd", "obj", "mtlx", "maps"]
 VARIANTS = {"variants": [{"name": "plain"}, {"name": "red"}]}

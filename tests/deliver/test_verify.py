@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gltf_cases import bumpy_sphere, no_texels, quarters
-from node_tools import modules
 
 from mistyle.cli.main import main
 from mistyle.core.errors import InputRefused, UsageError
@@ -20,6 +18,8 @@ from mistyle.deliver.verify import Rendering, compared, file_checks, table, veri
 from mistyle.deliver.verify_surfaces import surface_checks
 from mistyle.io.store.atomic import sha256_file
 from mistyle.render.external.blender import blender_command, find_blender
+from tests.support.gltf_cases import bumpy_sphere, no_texels, quarters
+from tests.support.node_tools import modules
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
 
@@ -288,7 +288,7 @@ def test_blender_is_asked_as_the_program_or_as_a_python(run, monkeypatch, tmp_pa
 
 
 def test_what_mitsuba_does_not_draw_is_not_compared(tmp_path, run):
-    from gltf_cases import strange_gltf
+    from tests.support.gltf_cases import strange_gltf
 
     path = strange_gltf(tmp_path / "strange.glb")
     told = verify(path, tmp_path / "out", blender=os.devnull, rendering=Rendering(1, 16, 1))

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOT, point_cloud
 from scipy.spatial.transform import Rotation
 
 from benchmarks.material_recovery import pictures as drawing
@@ -20,6 +19,7 @@ from mistyle.io.cameras.captures import read_shots
 from mistyle.io.cameras.sparse_points import sparse_points
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
+from tests.support.helpers import ROOT, point_cloud
 
 MESH = ROOT / "scenes" / "demo.obj"
 

@@ -8,8 +8,6 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from test_material import KEYS, SIDE, SIZE, bowl, orbit, photographed
-from test_passes import hashes
 
 import mistyle
 from benchmarks.captures.phone import Drawn, gains, photograph
@@ -22,6 +20,8 @@ from mistyle.fitting.settings.material import MaterialSettings, PhotometrySettin
 from mistyle.io.read_mesh import read_mesh
 from mistyle.solver.photometry import material as with_material
 from mistyle.solver.photometry.record import Gains
+from tests.fitting.test_material import KEYS, SIDE, SIZE, bowl, orbit, photographed
+from tests.fitting.test_passes import hashes
 
 QUICK = {
     "recover": {"solver": "texels", "rounds": 1, "solver_iterations": 4, "bounces": 0, "joint": 0},

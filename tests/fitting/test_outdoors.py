@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOT
 
 from benchmarks.material_recovery import pictures as drawing
 from mistyle.cli.fit import known_albedo
@@ -22,6 +21,7 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.solver.settings import RecoverSettings
+from tests.support.helpers import ROOT
 
 SIDE, VIEWS, TEXELS = 96, 8, 64
 SUN = np.array([0.6, 0.7, 0.39]) / np.linalg.norm([0.6, 0.7, 0.39])

@@ -6,7 +6,6 @@ import signal
 
 import numpy as np
 import pytest
-from test_material import SIDE, SIZE, bowl, one_by_one, orbit
 
 import mistyle
 from mistyle.cli.main import main
@@ -23,6 +22,7 @@ from mistyle.jobs import plan as jobs_plan
 from mistyle.jobs import progress as jobs_progress
 from mistyle.process import stopping
 from mistyle.solver.schedule import TYPICAL
+from tests.fitting.test_material import SIDE, SIZE, bowl, one_by_one, orbit
 
 BRIEF = {"iterations": 24, "rounds": 1, "solver_iterations": 6, "bounces": 1, "bounce_samples": 4, "joint": 1}
 SETTINGS = {"recover": BRIEF | {"joint_subsamples": 4}, "report": {"detail": "none"}, "atlas": {"size": SIZE}}

@@ -7,12 +7,12 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
-from helpers import data
 
 from benchmarks import data as fetching
 from benchmarks.material_recovery.pictures import fibonacci, one_at_a_time, together
 from benchmarks.material_recovery.truth import average, fitted_size, footprint, seen, truth
 from mistyle.core.maps import flat_maps
+from tests.support.helpers import data
 
 
 class Quiet(SimpleHTTPRequestHandler):

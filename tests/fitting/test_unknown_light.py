@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import ROOT
 
 from benchmarks.material_recovery import pictures as drawing
 from mistyle.atlas.texels import rasterise
@@ -26,6 +25,7 @@ from mistyle.solver import prior as recover_prior
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.texels.levenberg_marquardt import Options
 from mistyle.solver.texels.observations import ObservationOptions, collect_observations
+from tests.support.helpers import ROOT
 
 ALBEDO = (0.3, 0.45, 0.6)
 

@@ -7,10 +7,10 @@ needle whose angle rounds to 0; spot, Avocado, NormalTangentTest, capsule none).
 
 import numpy as np
 import pytest
-from helpers import data
-from node_tools import mikktspace as reference
 
 from mistyle.geometry.tangents import mikktspace
+from tests.support.helpers import data
+from tests.support.node_tools import mikktspace as reference
 
 # Both compute in float32 (0.006 degrees); only the order of the sums differs, which needles multiply.
 ROUNDING = 1e-4

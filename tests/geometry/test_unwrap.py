@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 import trimesh
-from helpers import data
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter, minimum_filter
@@ -21,6 +20,7 @@ from mistyle.geometry.unwrap import estimated_seconds, unwrap
 from mistyle.geometry.uvs import islands, signed_areas
 from mistyle.geometry.xatlas_worker import cut_overlaps, landscape, lay_flat, mend, pack, unmirror
 from mistyle.io.read_mesh import read_mesh
+from tests.support.helpers import data
 
 SIZE = 1024
 # xatlas lets borders that cross each other by less than a texel in a thousand through.

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers import ROOT, data
 
 from mistyle.geometry.upright import lies_on_its_side
 from mistyle.io.meshes.prepare import SIDEWAYS
 from mistyle.io.read_mesh import read_mesh
+from tests.support.helpers import ROOT, data
 
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # (x, y, z) with Y up -> (x, -z, y)
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from helpers import data
 from hypothesis import given
 from hypothesis import strategies as st
 
 from mistyle.geometry.raster import fragments
 from mistyle.geometry.uvs import arrange, group_rows, islands, judge, shift, signed_areas, tiles
 from mistyle.io.read_mesh import read_mesh
+from tests.support.helpers import data
 
 # A shift adds an integer of at most a few tiles in float32: half a unit in the last place at 16.
 SHIFT_ROUNDING = 1e-6

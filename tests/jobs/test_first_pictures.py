@@ -6,7 +6,6 @@ import shutil
 
 import numpy as np
 import pytest
-from test_pipeline import inputs, job  # noqa: F401  (a fixture)
 
 from mistyle.cli.main import main
 from mistyle.core.errors import Stopped, UsageError
@@ -17,6 +16,7 @@ from mistyle.jobs.report.pictures import Encoder
 from mistyle.stylization.pipeline import preview
 from mistyle.stylization.pipeline import stylize as pipeline
 from mistyle.stylization.settings import resolve
+from tests.stylization.test_pipeline import inputs, job  # noqa: F401  (a fixture)
 
 
 class Heard(Progress):

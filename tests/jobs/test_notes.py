@@ -4,13 +4,13 @@ import json
 from types import SimpleNamespace
 
 import pytest
-from verbs import VERBS
 
 from mistyle.cli.main import main
 from mistyle.jobs.progress import Progress, grouped
 from mistyle.stylization.optimise.judge import TOLERANCE, regressed, undone_where
 from mistyle.stylization.report import summary
 from mistyle.stylization.report.page import fit_facts
+from tests.support.verbs import VERBS
 
 NOTE = "The mesh has no normals"  # of the square: smooth ones are computed
 

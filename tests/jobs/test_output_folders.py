@@ -10,11 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
-from verbs import ATLAS, PAINT, VERBS, line
 
 from mistyle.batch import engines
 from mistyle.cli.main import main
 from mistyle.io.store import output
+from tests.support.verbs import ATLAS, PAINT, VERBS, line
 
 # What a second call would put in the place of a file that was edited since: refused, or set aside in a run folder.
 EDITS = {

@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from browser import BROWSER, NO_BROWSER, Browser
 from PIL import Image
-from test_report import Page, sample
 
 from mistyle.cli import lookdev as cli_lookdev
 from mistyle.cli.main import main
@@ -33,6 +31,8 @@ from mistyle.jobs.report.model import (
     viewer_script,
 )
 from mistyle.jobs.report.page import Report, write_report
+from tests.jobs.test_report import Page, sample
+from tests.support.browser import BROWSER, NO_BROWSER, Browser
 
 RED = (200, 24, 16)
 

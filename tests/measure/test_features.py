@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import data
 from torch import nn
 
 from mistyle.core.errors import InputRefused
 from mistyle.measure import features
 from mistyle.measure.features import SOFTNESS, filter_bank, load_features
 from mistyle.measure.losses import style_aligned, style_statistics
+from tests.support.helpers import data
 
 
 def picture(rng, channels=3, size=32, count=2):

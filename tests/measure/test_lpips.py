@@ -5,12 +5,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from helpers import data
 from torch import nn
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import gaussian
 from mistyle.measure.lpips import SCALE, SHIFT, TAPS, load_lpips, taps
+from tests.support.helpers import data
 
 FULL = np.ones((64, 64), bool)
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_metrics import plane_view
 
 from benchmarks.consistency import metrics as consistency
 from mistyle.core.camera import px_from_world, world_from_px
 from mistyle.measure.overlap import _axes, overlap, pixel_steps, seen_here, seen_there
+from tests.measure.test_metrics import plane_view
 
 FINER = 8  # lookups along each side of a pixel, which make its mean
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOT
 
 from mistyle.core.maps import Texels
 from mistyle.io.store.records import load_record, save_record
 from mistyle.process import memory
+from tests.support.helpers import ROOT
 
 FREED = """
 import ctypes, resource

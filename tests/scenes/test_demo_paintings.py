@@ -4,9 +4,10 @@ import importlib
 
 import numpy as np
 import pytest
-from helpers import ROOT
 from PIL import Image
 from scipy.ndimage import gaussian_filter, label, zoom
+
+from tests.support.helpers import ROOT
 
 SCENES = ROOT / "scenes"
 

@@ -4,10 +4,11 @@ import importlib
 
 import numpy as np
 import pytest
-from helpers import ROOT
 from PIL import Image
 from scipy.ndimage import gaussian_filter, zoom
 from scipy.spatial import ConvexHull
+
+from tests.support.helpers import ROOT
 
 SCENES = ROOT / "scenes"
 

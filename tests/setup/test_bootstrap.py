@@ -12,12 +12,12 @@ import sys
 import textwrap
 from pathlib import Path
 
-import conftest
 import pytest
-from helpers import ROOT
 from packaging.requirements import Requirement
 
 from mistyle.setup import bootstrap, environment
+from tests import conftest
+from tests.support.helpers import ROOT
 
 HEAVY = {"numpy", "pydantic", "rich", "torch", "mitsuba", "trimesh", "cv2", "scipy"}
 HELP_SECONDS = 0.5  # of processor time, which other programs on the machine do not lengthen

@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_install import program
 
 from mistyle.setup import environment, llvm
+from tests.setup.test_install import program
 
 # A system that lacks libllvm and libatomic1, as apt-get describes it.
 APT = """

@@ -10,12 +10,12 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from helpers import ROOT
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from mistyle.core.paths import PACKAGE
 from mistyle.stylization.models.catalogue import MODELS
+from tests.support.helpers import ROOT
 
 PROGRAM = sorted(PACKAGE.rglob("*.py"))
 EVIL = "<img src=x onerror=alert(1)>'\"&{{7*7}}</script><script>alert(2)</script>"

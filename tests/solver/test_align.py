@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import ROOT
 from scipy.spatial.transform import Rotation
 
 from mistyle.core.camera import Camera, orbit, px_from_world
@@ -42,6 +41,7 @@ from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
+from tests.support.helpers import ROOT
 
 SCALE = 3.7
 TRUE = similarity(

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_recover import DIRECT, LIGHTS, SIZE, directional, fibonacci, photographs, strong_maps
-from test_seam import sphere
 
 from benchmarks.material_recovery.metrics import calibration
 from mistyle.atlas.neighbours import of_islands
@@ -18,6 +16,8 @@ from mistyle.solver.recover import Recovered, recover
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import Atlas
 from mistyle.solver.texels.classes import metal_regions
+from tests.render.deferred.test_seam import sphere
+from tests.solver.test_recover import DIRECT, LIGHTS, SIZE, directional, fibonacci, photographs, strong_maps
 
 
 def labels(evidence: np.ndarray, apparent: np.ndarray) -> np.ndarray:

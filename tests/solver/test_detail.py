@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_recover import DIRECT, LIGHTS, QUICK, SIZE, directional, errors, fibonacci, photographs, strong_maps
-from test_seam import sphere
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.capture import in_memory
@@ -13,6 +11,18 @@ from mistyle.render.mitsuba import device
 from mistyle.solver.recover import recover
 from mistyle.solver.texels import detail
 from mistyle.solver.texels.detail import bands
+from tests.render.deferred.test_seam import sphere
+from tests.solver.test_recover import (
+    DIRECT,
+    LIGHTS,
+    QUICK,
+    SIZE,
+    directional,
+    errors,
+    fibonacci,
+    photographs,
+    strong_maps,
+)
 
 COARSE = QUICK.model_copy(update={"iterations": 0, "rounds": 1, "solver_texels": 1000})
 

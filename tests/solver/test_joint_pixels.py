@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_recover import LIGHTS, QUICK, SIZE, directional, hollow, strong_maps
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import look_at
@@ -18,6 +17,7 @@ from mistyle.solver.context import FitContext
 from mistyle.solver.indirect import Indirect
 from mistyle.solver.joint import pixels as joint_pixels
 from mistyle.solver.table import linked
+from tests.solver.test_recover import LIGHTS, QUICK, SIZE, directional, hollow, strong_maps
 
 SAMPLES = 256
 

@@ -1,8 +1,6 @@
 """Pictures that are averaged for a coarse level of the per-texel solver, and how coarse that level is."""
 
 import numpy as np
-from helpers import assert_same
-from test_recover import SIZE, errors, world  # noqa: F401  (a fixture)
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.capture import shrunk
@@ -11,6 +9,8 @@ from mistyle.solver.recover import recover
 from mistyle.solver.schedule import OBSERVED, SEEN, solver_level
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.texels import level_pictures
+from tests.solver.test_recover import SIZE, errors, world  # noqa: F401  (a fixture)
+from tests.support.helpers import assert_same
 
 SMALL = 20  # pixels of an estimate of indirect light: blocks of four pixels
 

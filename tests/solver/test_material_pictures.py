@@ -4,9 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from helpers import assert_same
-from test_material import QUICK, bowl, one_by_one, orbit
-from test_seam import KEY, SIZES, crop, random_maps, torus
 
 import mistyle
 from mistyle.atlas.texels import rasterise
@@ -20,6 +17,9 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.mitsuba import draw
 from mistyle.solver.texels import gbuffer as texel_views
 from mistyle.solver.validate import LEAST_PIXELS, downsampling_factors
+from tests.fitting.test_material import QUICK, bowl, one_by_one, orbit
+from tests.render.deferred.test_seam import KEY, SIZES, crop, random_maps, torus
+from tests.support.helpers import assert_same
 
 
 @pytest.fixture(scope="module")

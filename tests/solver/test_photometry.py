@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import ROOT
 
 from benchmarks.material_recovery import pictures as drawing
 from mistyle.core.camera import pixel_centres
@@ -36,6 +35,7 @@ from mistyle.solver.photometry.record import (
     with_gains,
 )
 from mistyle.solver.photometry.solve import PointSamples, Response, _with_exif, solve_photometry
+from tests.support.helpers import ROOT
 
 SIDE, VIEWS, TEXELS = 112, 24, 64
 LEVELS, OBSERVATIONS, ATLAS = 8_000, 80_000, 200  # of usually 40,000, 200,000 and 320

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_photometry import FALL, gains
-from test_seam import sphere
 
 from benchmarks.material_recovery import pictures as drawing
 from mistyle.core.camera import pixel_centres
@@ -21,6 +19,8 @@ from mistyle.solver.photometry import material
 from mistyle.solver.photometry.explain import explained
 from mistyle.solver.photometry.record import Gains, coordinates, fall_terms, unchanged, with_gains
 from mistyle.solver.texels.levenberg_marquardt import Options
+from tests.render.deferred.test_seam import sphere
+from tests.solver.test_photometry import FALL, gains
 
 SIDE, VIEWS, TEXELS = 96, 24, 64
 EACH = 100  # observations of a picture: a third of the usual number

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_seam import sphere
 
 from mistyle.atlas.frames import texel_frames
 from mistyle.atlas.neighbours import of_islands
@@ -38,6 +37,7 @@ from mistyle.solver.texels.observations import (
 )
 from mistyle.solver.texels.solve import TexelEstimate
 from mistyle.solver.validate import validate_captures
+from tests.render.deferred.test_seam import sphere
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
 QUICK = RecoverSettings(rounds=3, iterations=300, bounces=0)

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
-from test_recover import QUICK, errors, world  # noqa: F401
-from test_recover_smooth import atlas
 
 from mistyle.core.capture import subset
 from mistyle.core.image import gaussian
@@ -20,6 +18,8 @@ from mistyle.solver.prior import NOTHING
 from mistyle.solver.recover import recover
 from mistyle.solver.schedule import runnable
 from mistyle.solver.table import linked
+from tests.solver.test_recover import QUICK, errors, world  # noqa: F401
+from tests.solver.test_recover_smooth import atlas
 
 FEW = QUICK.model_copy(update={"iterations": 60, "rounds": 1})
 

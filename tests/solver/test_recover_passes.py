@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_recover import LIGHTS, QUICK, SIZE, directional, errors, fibonacci, photographs, strong_maps
-from test_seam import sphere
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.capture import in_memory
@@ -17,6 +15,8 @@ from mistyle.process import stopping
 from mistyle.render.mitsuba import device
 from mistyle.solver.recover import Checkpoints, Limits, recover
 from mistyle.solver.schedule import schedule, seconds, shares, size_from
+from tests.render.deferred.test_seam import sphere
+from tests.solver.test_recover import LIGHTS, QUICK, SIZE, directional, errors, fibonacci, photographs, strong_maps
 
 # Every kind of pass: solve, rounds with and without an estimate of indirect light, pictures, joint, polish.
 BRIEF = QUICK.model_copy(

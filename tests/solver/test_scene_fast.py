@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_scene_fit import bitmap, smooth
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.live import parameters as scene_keys
@@ -13,6 +12,7 @@ from mistyle.solver.scene import fit as scene_fit
 from mistyle.solver.scene import gradients as scene_grad
 from mistyle.solver.scene import state as scene_job
 from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
+from tests.solver.test_scene_fit import bitmap, smooth
 
 KEYS = ["wall.bsdf.base_color.data", "wall.bsdf.roughness.data", "wall.bsdf.normalmap.data", "ball.bsdf.base_color"]
 SIZE = 16

@@ -4,7 +4,6 @@ import inspect
 
 import numpy as np
 import pytest
-from test_scene_fit import CAMERAS, COLOUR, TRUE_COLOUR, flat, references, root_diffuse, wall
 
 import mistyle
 from mistyle.core.errors import UsageError
@@ -15,6 +14,7 @@ from mistyle.solver.scene import fit as scene_fit
 from mistyle.solver.scene import gauss_newton as scene_newton
 from mistyle.solver.scene import gradients as scene_grad
 from mistyle.solver.scene import state as scene_job
+from tests.solver.test_scene_fit import CAMERAS, COLOUR, TRUE_COLOUR, flat, references, root_diffuse, wall
 
 WHITE, GREEN, RED = (f"{name}.reflectance.value" for name in ("white", "green", "red"))
 TRUE = {WHITE: [0.88, 0.7, 0.66], GREEN: [0.11, 0.38, 0.08], RED: [0.57, 0.05, 0.05]}

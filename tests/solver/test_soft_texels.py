@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_recover import errors, fibonacci, photographs, strong_maps
-from test_seam import sphere
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import look_at
@@ -18,6 +16,8 @@ from mistyle.solver.recover import recover
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.texels.gbuffer import SKY_CELLS, open_sky, rig
 from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Points, Problem
+from tests.render.deferred.test_seam import sphere
+from tests.solver.test_recover import errors, fibonacci, photographs, strong_maps
 
 SUN = SphericalGaussian(axis=(0.0, 0.6, 0.8), sharpness=400.0, amplitude=(30.0, 20.0, 10.0))
 EVEN = Ambient((0.5, 1.0, 2.0))

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers import data
 from PIL import Image
 
 from mistyle.core.errors import UsageError
@@ -20,6 +19,7 @@ from mistyle.solver.shape.moved import displaced_asset
 from mistyle.stylization.pipeline import stylize as pipeline
 from mistyle.stylization.pipeline.job import Job
 from mistyle.stylization.settings import resolve
+from tests.support.helpers import data
 
 TINY = {
     "rig": {"resolution": 96},

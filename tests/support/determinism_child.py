@@ -239,10 +239,9 @@ def photographs(mesh: Any, size: int) -> tuple[Any, Any]:
 
 def recovered(made: Stages) -> None:
     """Per-texel Levenberg-Marquardt, then Adam on whole pictures."""
-    from test_seam import sphere
-
     from mistyle.solver.recover import recover
     from mistyle.solver.settings import RecoverSettings
+    from tests.render.deferred.test_seam import sphere
 
     mesh = sphere(rings=16, sides=12)
     texels, captures = photographs(mesh, 32)
@@ -254,9 +253,8 @@ def recovered(made: Stages) -> None:
 
 def scene_fitted(made: Stages) -> None:
     """A live Mitsuba scene through prb."""
-    from test_scene_fit import COLOUR, ROUGH, flat, references
-
     from mistyle.solver.scene.fit import fit_scene
+    from tests.solver.test_scene_fit import COLOUR, ROUGH, flat, references
 
     pictures = references(flat(), spp=4)
     made.note("scene: pictures", pictures)

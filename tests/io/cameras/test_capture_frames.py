@@ -15,8 +15,6 @@ import numpy as np
 import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
-from test_colmap import Model, write_bin, write_txt
-from test_read_pictures import png16
 
 from mistyle.core.asset import Pixels
 from mistyle.core.camera import Camera, orbit
@@ -29,6 +27,8 @@ from mistyle.io.cameras.reading_notes import reading_notes
 from mistyle.io.cameras.views import read_views
 from mistyle.io.images.write import write_exr
 from mistyle.io.read import read_picture, read_size, read_stored_size
+from tests.io.cameras.test_colmap import Model, write_bin, write_txt
+from tests.io.images.test_read_pictures import png16
 
 TALL, WIDE = 32, 48  # of the stored pixels
 FOCAL = 60.0

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import point_cloud
 from scipy.spatial.transform import Rotation
 
 from mistyle.core.camera import px_from_world
@@ -13,6 +12,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.io.cameras.captures import read_shots
 from mistyle.io.cameras.sparse_points import sparse_points
 from mistyle.io.images.write import write_png
+from tests.support.helpers import point_cloud
 
 SIZE = (48, 64)
 APPLIED = [[0.0, 2, 0, 0.3], [0, 0, 2, -1], [2, 0, 0, 0.5]]

@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gltf_cases import (
+
+from mistyle.core.errors import InputRefused, MistyleError
+from mistyle.io.gltf.write import patch_glb, write_glb
+from tests.support.gltf_cases import (
     BLUE,
     GREEN,
     RED,
@@ -20,12 +23,9 @@ from gltf_cases import (
     quarters,
     strange_gltf,
 )
-from helpers import data
-from node_tools import gltf_issues
-from node_tools import mikktspace as reference_tangents
-
-from mistyle.core.errors import InputRefused, MistyleError
-from mistyle.io.gltf.write import patch_glb, write_glb
+from tests.support.helpers import data
+from tests.support.node_tools import gltf_issues
+from tests.support.node_tools import mikktspace as reference_tangents
 
 ERROR, WARNING = 0, 1
 OPEN = np.ones((16, 16), np.float32)

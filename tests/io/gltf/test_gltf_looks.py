@@ -9,10 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from gltf_cases import glb_parts, quarters
 from PIL import Image
-from test_read import check_asset
-from test_read_gltf import File, Tree, glb, shown, square, textured
 
 from mistyle.atlas.texels import rasterise, start_maps
 from mistyle.core.asset import Asset
@@ -25,6 +22,9 @@ from mistyle.io.gltf.write import patch_glb
 from mistyle.io.meshes import lookups
 from mistyle.io.read_mesh import read_extent, read_mesh
 from mistyle.render.mitsuba.draw import draw_views
+from tests.io.gltf.test_read_gltf import File, Tree, glb, shown, square, textured
+from tests.io.meshes.test_read import check_asset
+from tests.support.gltf_cases import glb_parts, quarters
 
 SIDE = 8
 INNER = np.array([[x, y] for x in (0.13, 0.38, 0.61, 0.9) for y in (0.07, 0.3, 0.55, 0.84)])

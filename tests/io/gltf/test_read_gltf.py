@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from helpers import data
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from test_read import check_asset
 
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
 from mistyle.io.gltf.read import read_gltf, world_matrices
 from mistyle.io.meshes.parsed_mesh import Corners
 from mistyle.io.read_mesh import load_gltf, read_mesh
+from tests.io.meshes.test_read import check_asset
+from tests.support.helpers import data
 
 Tree = dict[str, Any]
 TYPES = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121, "i2": 5122, "i1": 5120}

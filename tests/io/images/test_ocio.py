@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from gltf_cases import no_texels, quad, quarters
 from PIL import Image
 
 from mistyle.core.capture import Captures
@@ -20,6 +19,7 @@ from mistyle.deliver.colour import in_working_space, key_of, read_style
 from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.io.images.write import write_exr
 from mistyle.jobs.deliver_settings import ColourSettings
+from tests.support.gltf_cases import no_texels, quad, quarters
 
 pytest.importorskip("PyOpenColorIO")
 from mistyle.io.images.ocio import KNOWN, colour_space, exr_tags

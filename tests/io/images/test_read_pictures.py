@@ -9,7 +9,6 @@ import numpy as np
 import OpenEXR
 import pytest
 import tifffile
-from helpers import data
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageCms
@@ -20,6 +19,7 @@ from mistyle.io.images import hdr
 from mistyle.io.images import read as pictures
 from mistyle.io.images.read import Budget, decode
 from mistyle.io.read import read_exr, read_hdr, read_picture
+from tests.support.helpers import data
 
 # One step of an 8-bit channel; lossy codecs stay within a few.
 STEP = 1 / 255

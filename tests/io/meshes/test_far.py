@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from gltf_cases import no_texels, quarters
 
 from mistyle.core.mesh import local_origin
 from mistyle.deliver.asset import write_asset
 from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.io.read_mesh import read_mesh
 from mistyle.io.usd.write import library
+from tests.support.gltf_cases import no_texels, quarters
 
 # Where the middle is, and how far the mesh reaches from there: UTM, and a national grid with a wide tile.
 PLACES = {

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import data
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -20,6 +19,7 @@ from mistyle.io.meshes.stl_off_read import read_off, read_stl
 from mistyle.io.read import read_json
 from mistyle.io.read_mesh import read_mesh
 from mistyle.io.sandbox import bounds
+from tests.support.helpers import data
 
 # float32 positions in the unit sphere
 FLOAT32 = 1e-6

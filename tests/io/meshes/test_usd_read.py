@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gltf_cases import bumpy_sphere, no_texels, quarters
 from PIL import Image
 
 from mistyle.core.errors import InputRefused
@@ -13,6 +12,7 @@ from mistyle.core.image import linear_from_srgb
 from mistyle.geometry.normals import area_vectors
 from mistyle.io.read_mesh import read_mesh
 from mistyle.io.usd.read import read_usd
+from tests.support.gltf_cases import bumpy_sphere, no_texels, quarters
 
 pxr = pytest.importorskip("pxr")
 

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import ROOT, data
 
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.io.images.write import write_exr, write_png
@@ -25,6 +24,7 @@ from mistyle.io.read import read_exr, read_json, read_npy, read_picture, read_si
 from mistyle.io.read_mesh import read_mesh
 from mistyle.io.sandbox import bounds, reader_process, rpc_codec, shared_copy
 from mistyle.process import weights
+from tests.support.helpers import ROOT, data
 
 posix = os.name == "posix"
 
@@ -549,7 +549,7 @@ def test_small_files_that_ask_for_much_are_refused_early(name: str, tmp_path: Pa
 
 
 def test_nasty_meshes_are_all_in_the_table():
-    from test_read import NASTY
+    from tests.io.meshes.test_read import NASTY
 
     assert {p.name for p in data("meshes/nasty").iterdir()} == set(NASTY)
 

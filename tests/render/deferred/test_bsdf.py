@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers import from_front
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.deferred import bsdf
 from mistyle.render.mitsuba import device
+from tests.support.helpers import from_front
 
 COUNT = 8000
 UP = np.array([0, 0, 1], np.float32)

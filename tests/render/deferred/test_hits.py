@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import scipy.sparse as sparse
-from test_seam import KEY, SIZES, crop, random_maps, torus
 
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Ambient, Directional, Environment, Point, SceneLights, SphericalGaussian
@@ -12,6 +11,7 @@ from mistyle.render.deferred import sky as skies
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
+from tests.render.deferred.test_seam import KEY, SIZES, crop, random_maps, torus
 
 
 @pytest.fixture(scope="module")

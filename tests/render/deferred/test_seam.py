@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from helpers import recordings
 
 from mistyle.core.camera import Camera, orbit, zoom
 from mistyle.core.light import Ambient, Directional
@@ -14,6 +13,7 @@ from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import torch_bridge
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
+from tests.support.helpers import recordings
 
 KEY = Directional((-0.5, -0.5, -0.7071), (2.0, 1.5, 1.0), "camera")
 SIZES = [(24, 40), (32, 32)]

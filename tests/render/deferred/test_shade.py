@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import recordings
-from test_seam import KEY, SIZES, crop, plain_scene, random_maps, torus
 
 from mistyle.core.camera import orbit
 from mistyle.core.capture import in_memory
@@ -18,6 +16,8 @@ from mistyle.render.deferred import renderer as shade
 from mistyle.render.deferred.material_table import pack, unpack
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
+from tests.render.deferred.test_seam import KEY, SIZES, crop, plain_scene, random_maps, torus
+from tests.support.helpers import recordings
 
 RIM = Directional((0.8, 0.36, 0.48), (0.6, 1.2, 2.0))
 LAMP = Point((1.5, 1.0, 1.5), (3.0, 2.5, 2.0))

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import from_front
 from PIL import Image
-from test_read_gltf import INDEX, NORMAL, POSITION, File, square
 
 from mistyle.core.asset import Asset, Shading
 from mistyle.core.camera import orbit
@@ -20,6 +18,8 @@ from mistyle.io.read_mesh import load_gltf, read_mesh
 from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.lookdev.scenes import material_maps
 from mistyle.render.mitsuba import appearance
+from tests.io.gltf.test_read_gltf import INDEX, NORMAL, POSITION, File, square
+from tests.support.helpers import from_front
 
 WHITE = (Ambient((1.0, 1.0, 1.0)),)
 DARK = (Ambient((0.0, 0.0, 0.0)),)

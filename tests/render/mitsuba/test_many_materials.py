@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from test_seam import random_maps, torus
 
 from mistyle.cli.main import main
 from mistyle.core.asset import Material
@@ -28,6 +27,7 @@ from mistyle.render.mitsuba import texture_pages as pages
 from mistyle.stylization.pipeline import budget as stylize_budget
 from mistyle.stylization.pipeline import single_stages as verbs
 from mistyle.stylization.settings import resolve
+from tests.render.deferred.test_seam import random_maps, torus
 
 STYLE = str(scenes() / "demo_style.png")
 SMALL = {"rig": {"kind": "turntable", "views": 2, "resolution": 32}, "draw": {"spp": 1}, "atlas": {"size": 32}}

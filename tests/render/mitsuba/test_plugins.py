@@ -4,9 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import from_front
-from test_bsdf import albedo_of, cases, loaded
-from test_seam import KEY, Path, crop, random_maps, tables, torus
 
 from mistyle.core.light import direction_in_world
 from mistyle.core.mesh import Mesh, weld
@@ -15,6 +12,9 @@ from mistyle.render.deferred import bsdf
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.mitsuba import device, draw, plugins
 from mistyle.render.mitsuba import scene as scenery
+from tests.render.deferred.test_bsdf import albedo_of, cases, loaded
+from tests.render.deferred.test_seam import KEY, Path, crop, random_maps, tables, torus
+from tests.support.helpers import from_front
 
 SIZE = (32, 32)
 

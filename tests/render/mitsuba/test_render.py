@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import ROOT
 
 from mistyle.core.camera import Camera, orbit, pixel_centres, px_from_world, world_from_px, zoom
 from mistyle.core.drjit_arrays import aligned
@@ -27,6 +26,7 @@ from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.render.mitsuba import device, draw, scene
 from mistyle.render.mitsuba.scene import Staging
+from tests.support.helpers import ROOT
 
 # Ray tracing in float32 about four units away.
 TRACED = 2e-5

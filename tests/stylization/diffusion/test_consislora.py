@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import tiny_models
 import torch
 from diffusers import StableDiffusionXLPipeline
 
@@ -11,6 +10,7 @@ from mistyle.stylization.diffusion import consislora
 from mistyle.stylization.diffusion import lora_files as consislora_make
 from mistyle.stylization.diffusion import lora_training as consislora_train
 from mistyle.stylization.diffusion.settings import ModelSettings, TrainSettings
+from tests.support import tiny_models
 
 torch.set_num_threads(1)
 SETTINGS = TrainSettings(rank=4, steps=6, style_steps=4, switch=3, resolution=32, save_every=2)

@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-import tiny_models
 import torch
 from safetensors.torch import load_file, save_file
 
@@ -15,6 +14,7 @@ from mistyle.stylization.diffusion import lora_files as consislora_make
 from mistyle.stylization.diffusion import lora_training as consislora_train
 from mistyle.stylization.diffusion.settings import ModelSettings, TrainSettings
 from mistyle.stylization.models import check as models_check
+from tests.support import tiny_models
 
 torch.set_num_threads(1)
 SETTINGS = TrainSettings(rank=4, steps=24, style_steps=6, switch=12, resolution=16)

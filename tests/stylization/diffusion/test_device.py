@@ -5,12 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import standin
-import test_diffusion as views_of
-import test_paint3d as atlas_of
-import tiny_models
 import torch
-from test_surface_paint import asset_of
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Picture
@@ -29,6 +24,10 @@ from mistyle.stylization.pipeline.generative import inpainter_inputs
 from mistyle.stylization.pipeline.job import STAGES, Job
 from mistyle.stylization.records import Atlas, Baked
 from mistyle.stylization.settings import resolve
+from tests.stylization.diffusion import test_diffusion as views_of
+from tests.stylization.diffusion import test_paint3d as atlas_of
+from tests.stylization.surface.test_surface_paint import asset_of
+from tests.support import standin, tiny_models
 
 torch.set_num_threads(1)
 

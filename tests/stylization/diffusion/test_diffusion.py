@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_models
 import torch
 
 from mistyle.core.camera import orbit
@@ -20,6 +19,7 @@ from mistyle.stylization.diffusion.settings import DiffusionSettings, ModelSetti
 from mistyle.stylization.models import folder as models
 from mistyle.stylization.mvst.settings import SweepSettings
 from mistyle.stylization.mvst.sweep import ViewPainter, ViewStore, sweep
+from tests.support import tiny_models
 
 torch.set_num_threads(1)
 SIDE = 32

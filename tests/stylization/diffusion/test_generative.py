@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny_models
 import trimesh
 from PIL import Image
 
@@ -16,6 +15,7 @@ from mistyle.io.cameras.views import read_views
 from mistyle.io.store.records import load_record
 from mistyle.stylization.diffusion import consislora
 from mistyle.stylization.pipeline.generative import opaque, watcher
+from tests.support import tiny_models
 
 SETTINGS = {
     "rig.views": 3,

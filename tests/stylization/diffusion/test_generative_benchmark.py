@@ -4,7 +4,8 @@ import json
 import sys
 
 import torch
-from helpers import ROOT
+
+from tests.support.helpers import ROOT
 
 
 def test_every_pair_of_choices_runs_in_half_precision(monkeypatch, tmp_path):

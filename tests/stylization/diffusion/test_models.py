@@ -16,9 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import safetensors.torch
-import tiny_models
 import torch
-from helpers import ROOT
 from safetensors.torch import load_file, save_file
 
 from mistyle.cli.main import main
@@ -29,6 +27,8 @@ from mistyle.stylization.models import fetch as models_fetch
 from mistyle.stylization.models import folder as models
 from mistyle.stylization.models import load as models_load
 from mistyle.stylization.models.catalogue import ENCODER
+from tests.support import tiny_models
+from tests.support.helpers import ROOT
 
 torch.set_num_threads(1)
 
@@ -411,7 +411,7 @@ def test_names_that_are_not_models_are_refused():
 
 def test_a_single_checkpoint_loads_like_the_folder(tmp_path):
     """SDXL as one file in its original layout, with the configurations of the folder, gives the same networks."""
-    from original_layout import single_file
+    from tests.support.original_layout import single_file
 
     place = tmp_path / "models" / "sdxl"
     torch.manual_seed(0)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import tiny_models
 import torch
 
 from mistyle.atlas.texels import rasterise
@@ -14,6 +13,7 @@ from mistyle.stylization.inpaint import paint3d
 from mistyle.stylization.inpaint import paint3d_plan as plan
 from mistyle.stylization.inpaint.repair import repair
 from mistyle.stylization.inpaint.settings import RepairSettings
+from tests.support import tiny_models
 
 torch.set_num_threads(1)
 SETTINGS = Paint3dSettings(size=32, overlap=8, steps=2)

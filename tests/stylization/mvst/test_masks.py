@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_warp import BALL, at, see
 
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.core.image import overlap, srgb_from_linear
 from mistyle.stylization.mvst import masks
 from mistyle.stylization.mvst.settings import SweepSettings
 from mistyle.stylization.mvst.sweep import ViewPainter, sweep
+from tests.stylization.mvst.test_warp import BALL, at, see
 
 
 class Session:
@@ -138,7 +138,7 @@ def test_a_real_onnx_file_is_opened_and_run(tmp_path, side):
 @pytest.mark.parametrize("half", [False, True])
 def test_a_network_of_birefnets_signature_runs_in_both_precisions(tmp_path, half):
     """What is brighter than ImageNet's mean in all channels is foreground; the last of several answers counts."""
-    import tiny_models
+    from tests.support import tiny_models
 
     tiny_models.birefnet(tmp_path / "birefnet", half)
     (file,) = (tmp_path / "birefnet").glob("*.onnx")

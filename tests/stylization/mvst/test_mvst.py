@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from test_warp import BALL, at, colours, see
 
 from mistyle.core.camera import angular_order, rig
 from mistyle.core.image import erode, match_histogram, overlap, srgb_from_linear
@@ -10,6 +9,7 @@ from mistyle.core.settings import RigSettings
 from mistyle.core.view import Prior, View
 from mistyle.stylization.mvst.settings import SweepSettings
 from mistyle.stylization.mvst.sweep import PaintedView, ViewPainter, ViewStore, sweep, towards, visiting
+from tests.stylization.mvst.test_warp import BALL, at, colours, see
 
 SETTINGS = SweepSettings()
 

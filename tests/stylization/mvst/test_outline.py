@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_warp import at, see
 
 from mistyle.core.image import dilate, erode, gaussian
 from mistyle.stylization.mvst.outline import carried, displacement, distance_to, follow, signed
+from tests.stylization.mvst.test_warp import at, see
 
 SIZE = 192
 

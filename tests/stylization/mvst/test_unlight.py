@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_diffusion import view
 
 from mistyle.stylization.mvst import unlight
+from tests.stylization.diffusion.test_diffusion import view
 
 
 def shading(seen) -> np.ndarray:

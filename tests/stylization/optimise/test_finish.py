@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_pipeline import TINY, hashes, inputs  # noqa: F401
-from test_seam import sphere
 from torch import nn
 
 from mistyle.atlas.texels import rasterise
@@ -29,6 +27,8 @@ from mistyle.stylization.pipeline.finishing import check_finish
 from mistyle.stylization.pipeline.job import Job
 from mistyle.stylization.settings import resolve
 from mistyle.stylization.surface.lookup import PaintedSurface, colour
+from tests.render.deferred.test_seam import sphere
+from tests.stylization.test_pipeline import TINY, hashes, inputs  # noqa: F401
 
 SIZE = 64
 QUICK = FinishSettings(method="vgg", steps=3, crops=2, crop_size=64, texels_per_pixel=1)

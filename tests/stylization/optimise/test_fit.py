@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_seam import sphere
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import rig
@@ -21,6 +20,7 @@ from mistyle.stylization.optimise import judge as fit_judge
 from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise.settings import FitSettings
 from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, shrinkage, two_phase
+from tests.render.deferred.test_seam import sphere
 
 SIZE, RESOLUTION = 128, 112
 QUICK = FitSettings(

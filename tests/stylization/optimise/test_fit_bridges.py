@@ -4,9 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import data, recordings
-from test_fit import QUICK, RESOLUTION, SIZE, correlation, painting
-from test_seam import sphere
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import rig
@@ -21,6 +18,9 @@ from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise import two_phase as fitting
 from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, two_phase
 from mistyle.stylization.settings import PRESETS
+from tests.render.deferred.test_seam import sphere
+from tests.stylization.optimise.test_fit import QUICK, RESOLUTION, SIZE, correlation, painting
+from tests.support.helpers import data, recordings
 
 VGG = "weights/vgg19_normalised_relu3_1.pth"
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_surface import dented_ball
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.maps import flat_maps
 from mistyle.stylization.optimise.light_left import light_left
+from tests.stylization.surface.test_surface import dented_ball
 
 
 @pytest.mark.parametrize(("lit", "ratio"), [(0.0, 1.0), (0.8, 3.0)])

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_seam import sphere
 
 from benchmarks.material_recovery.metrics import map_errors, texel_areas
 from benchmarks.two_phase import struggle
@@ -32,6 +31,7 @@ from mistyle.stylization.pipeline.generative import lights_of_views
 from mistyle.stylization.records import Atlas, Baked
 from mistyle.stylization.report.summary import MEANINGS
 from mistyle.stylization.settings import Settings, resolve
+from tests.render.deferred.test_seam import sphere
 
 SIZE, RESOLUTION, SLOPE = 48, 56, 0.2
 IDENTITY = np.eye(4, dtype=np.float32)

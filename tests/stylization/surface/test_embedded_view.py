@@ -6,10 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers import fixed_surface
-from test_mvst import disagreement
-from test_pipeline import TINY, hashes, inputs, job
-from test_warp import at, see
 
 from mistyle.core.asset import Picture
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
@@ -24,6 +20,10 @@ from mistyle.stylization.pipeline.job import Job
 from mistyle.stylization.settings import resolve
 from mistyle.stylization.surface import view_samples
 from mistyle.stylization.surface.samples import GRID
+from tests.stylization.mvst.test_mvst import disagreement
+from tests.stylization.mvst.test_warp import at, see
+from tests.stylization.test_pipeline import TINY, hashes, inputs, job
+from tests.support.helpers import fixed_surface
 
 __all__ = ["inputs"]
 RADIUS = 0.9

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from helpers import fixed_surface
-from test_surface import plain_cost, plane_level, small_search
 
 from mistyle.render.mitsuba import device
 from mistyle.stylization.surface import field, kernels, pieces, synthesis
 from mistyle.stylization.surface.exemplar import exemplar as style
 from mistyle.stylization.surface.guides import guides
+from tests.stylization.surface.test_surface import plain_cost, plane_level, small_search
+from tests.support.helpers import fixed_surface
 
 
 @pytest.fixture(scope="module")

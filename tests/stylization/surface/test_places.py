@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from helpers import fixed_surface
 from scipy.spatial import KDTree
-from test_surface import dented_ball, mesh_of, solved, strokes
 
 from mistyle.stylization.surface import kernels, samples, synthesis
 from mistyle.stylization.surface.guides import creases, places
+from tests.stylization.surface.test_surface import dented_ball, mesh_of, solved, strokes
+from tests.support.helpers import fixed_surface
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import cv2
 import numpy as np
 import pytest
-from helpers import data, fixed_surface
 
 from mistyle.core.errors import UsageError
 from mistyle.stylization.settings import resolve
@@ -13,6 +12,7 @@ from mistyle.stylization.surface.exemplar import exemplar as style
 from mistyle.stylization.surface.exemplar.chosen import FROM_PAINTING, flat, graphic, resolved, settled
 from mistyle.stylization.surface.exemplar.reading import read_style
 from mistyle.stylization.surface.settings import SurfaceSettings
+from tests.support.helpers import data, fixed_surface
 
 
 def noise(size=(384, 512), blur=2.0, seed=0):

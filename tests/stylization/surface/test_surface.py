@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import data, fixed_surface
 from scipy.spatial import KDTree
 
 from mistyle.core.asset import Picture
@@ -18,6 +17,7 @@ from mistyle.stylization.surface import field, kernels, lookup, samples, synthes
 from mistyle.stylization.surface.exemplar import exemplar as style
 from mistyle.stylization.surface.guides import creases, guides, linefield
 from mistyle.stylization.surface.settings import SurfaceSettings
+from tests.support.helpers import data, fixed_surface
 
 
 def mesh_of(positions, faces, normals=None) -> Mesh:

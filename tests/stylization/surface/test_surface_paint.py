@@ -7,9 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import fixed_surface
 from scipy.spatial import KDTree
-from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, solved, spread_on, strokes  # noqa: F401
 
 from mistyle.atlas.texels import rasterise
 from mistyle.cli import options
@@ -34,6 +32,18 @@ from mistyle.stylization.surface.exemplar import relief as reliefs
 from mistyle.stylization.surface.guides import guides, linefield
 from mistyle.stylization.surface.guides.glaze import band, glaze
 from mistyle.stylization.surface.settings import SurfaceSettings
+from tests.stylization.surface.test_surface import (  # noqa: F401
+    box,
+    dented_ball,
+    dj,
+    mesh_of,
+    open_sky,
+    sheet,
+    solved,
+    spread_on,
+    strokes,
+)
+from tests.support.helpers import fixed_surface
 
 
 def on_a_ball(count: int, rng):
