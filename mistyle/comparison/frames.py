@@ -11,8 +11,8 @@ from mistyle.core.paths import real_path
 # The order of preference among files of one name. Formats that mistyle cannot open count as pictures too: their rows
 # then fail, and no frame passes unopened.
 ENDINGS = (
-    *(".exr", ".hdr", ".png", ".tif", ".tiff", ".webp", ".bmp", ".tga", ".jpg", ".jpeg", ".jfif", ".avif", ".gif"),
-    *(".dpx", ".cin", ".pfm", ".ppm", ".pgm", ".pnm", ".jp2", ".j2k", ".jxl", ".heic", ".heif", ".sgi", ".iff", ".tx"),
+    *(".exr", ".hdr", ".pfm", ".png", ".tif", ".tiff", ".webp", ".bmp", ".tga", ".jpg", ".jpeg", ".jfif", ".avif"),
+    *(".gif", ".dpx", ".cin", ".ppm", ".pgm", ".pnm", ".jp2", ".j2k", ".jxl", ".heic", ".heif", ".sgi", ".iff", ".tx"),
 )
 
 

@@ -44,6 +44,8 @@ __all__ = [
     "shrink_picture",
 ]
 
+HIGH = (".exr", ".hdr", ".pfm", ".tif", ".tiff")  # pictures whose values may be linear floats
+
 
 def read_exposure(path: Path) -> tuple[float, float, float]:
     """Exposure time in seconds, f-number and ISO speed by EXIF; NaN for each that the picture does not have."""
@@ -62,13 +64,13 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
 
 def read_frame(path: Path) -> LayeredPicture:
     """A picture to compare: the layers of an .exr (of all its parts, whatever their windows) by name, or the one layer
-    of an .hdr, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept. A TIFF of
+    of an .hdr, .pfm, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept. A TIFF of
     floating-point numbers holds linear values.
 
     Checked like `read_exr` and `read_picture`: header first, bounded. Two layers of one name are refused.
     """
     path = Path(path)
-    frame = ask("frame", path) if path.suffix.lower() in (".exr", ".hdr", ".tif", ".tiff") else None
+    frame = ask("frame", path) if path.suffix.lower() in HIGH else None
     return frame_of(read_picture(path)) if frame is None else frame
 
 

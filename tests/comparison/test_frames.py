@@ -132,6 +132,28 @@ def test_a_tiff_of_floats_is_linear(tmp_path, capsys, rng, options):
     assert code == 0 and record["rows"][0]["values"]["relmse"] == 0 and "taken as linear" in said
 
 
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("grey", [False, True])
+def test_a_portable_float_map_is_linear(tmp_path, capsys, rng, order, grey):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    rgb = 4 * picture(rng)
+    rgb = rgb[..., :1] if grey else rgb
+    header = f"P{'f' if grey else 'F'}\n{rgb.shape[1]} {rgb.shape[0]}\n{'-' if order == '<' else ''}2.0\n"
+    b = tmp_path / "b.pfm"
+    b.write_bytes(header.encode() + (rgb[::-1] / 2).astype(f"{order}f4").tobytes())
+    assert np.array_equal(np.array(mi.Bitmap(str(b))).reshape(rgb.shape), rgb)
+    a = save(tmp_path / "a.exr", np.broadcast_to(rgb, (*rgb.shape[:2], 3)))
+    code, record, _ = run(capsys, a, b, "-o", tmp_path / "out", "--metrics", "relmse", "--max", "relmse=1e-12")
+    assert code == 0 and record["rows"][0]["values"]["relmse"] == 0
+    b.write_bytes(b.read_bytes()[:-8])
+    assert run(capsys, a, b, "-o", tmp_path / "out2")[0] == 3
+    b.write_bytes(b"PX\n3 3\n-1.0\n" + bytes(108))
+    code, _, said = run(capsys, a, b, "-o", tmp_path / "out3")
+    assert code == 3 and "PFM header" in said
+
+
 def test_alpha_of_a_tiff_of_floats(tmp_path, capsys, rng):
     rgb, alpha = picture(rng), np.full((40, 50), 0.25, np.float32)
     a = save(tmp_path / "a.exr", rgb * 0.25, A=alpha)

@@ -99,6 +99,8 @@ def load_gltf(path: Path, say: Callable[[str], None] = lambda note: None) -> tup
                 path, f"{len(data) >> 20} MiB of JSON", f"at most {MAX_JSON_BYTES >> 20} MiB", "Export it as .glb"
             )
         tree = parse_json(data, path)
+    if any(isinstance(tree.get(name), dict) for name in ("accessors", "buffers", "meshes")):
+        raise refuse(path, "glTF 1.0", "glTF 2.0", "Convert it (npx gltf-pipeline -i IN.gltf -o OUT.gltf)")
     document = _validated(tree, path)
     if not document.asset.version.startswith("2."):
         raise refuse(path, f"glTF version {document.asset.version[:20]}", "2.0", "Convert it to glTF 2.0")

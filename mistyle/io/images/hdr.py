@@ -1,5 +1,6 @@
 """Reader of OpenEXR and Radiance files, header first."""
 
+import math
 import re
 import sys
 from pathlib import Path
@@ -141,6 +142,23 @@ def read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
     if pixels is None or pixels.shape != (height, width, 3) or pixels.dtype != np.float32:
         raise refuse(path, "pixels that cannot be decoded", f"{width} x {height} RGBE pixels", AGAIN)
     return np.ascontiguousarray(pixels[..., ::-1])
+
+
+def read_pfm(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """A portable float map, in colour or grey, times the scale in its header: linear values, row 0 at the top."""
+    data = read_bytes(path, 512 << 20)
+    header = re.match(rb"P([Ff])\s+(\d{1,6})\s+(\d{1,6})\s+([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s", data)
+    if header is None or not float(header[4]):
+        raise refuse(path, "no PFM header (PF or Pf, width, height, scale)", "a .pfm file", "Write it again as .exr")
+    shape = int(header[3]), int(header[2]), 3 if header[1] == b"F" else 1
+    if not 0 < shape[0] * shape[1] <= MAX_PIXELS:
+        raise refuse(path, f"{shape[1]} x {shape[0]} pixels", f"1 to {MAX_PIXELS / 1e6:.0f} million", "Scale it down")
+    count, order = math.prod(shape), "<" if header[4].startswith(b"-") else ">"
+    if len(data) - header.end() < 4 * count:
+        raise refuse(path, f"{len(data) - header.end()} bytes of pixels", f"{4 * count}", AGAIN)
+    # As Mitsuba; OpenCV divides by the scale.
+    rows = np.frombuffer(data, f"{order}f4", count, header.end()).reshape(shape) * np.float32(abs(float(header[4])))
+    return np.broadcast_to(rows[::-1], (*shape[:2], 3)).astype(np.float32)
 
 
 def _rgbe(path: Path, data: bytes) -> Any:

@@ -69,8 +69,8 @@ class Layer:
 
 @dataclass(frozen=True)
 class LayeredPicture:
-    """A picture file. `high`: its values are not bounded by 1 (EXR, HDR). `chromaticities` are its header's (Rec.709
-    without an entry)."""
+    """A picture file. `high`: its values are not bounded by 1 (EXR, HDR, PFM). `chromaticities` are its header's
+    (Rec.709 without an entry)."""
 
     path: Path
     layers: tuple[Layer, ...]
@@ -84,13 +84,13 @@ class LayeredPicture:
 
 
 def read_frame(path: Path) -> LayeredPicture | None:
-    """An .exr, an .hdr, or a TIFF of floating-point numbers (None for other TIFFs); see io/read.py."""
+    """An .exr, an .hdr, a .pfm, or a TIFF of floating-point numbers (None for other TIFFs); see io/read.py."""
     path = Path(path)
     kind = path.suffix.lower()
     if kind == ".exr":
         return _read_exr(path)
-    if kind == ".hdr":
-        rgb = hdr.read_hdr(path)
+    if kind in (".hdr", ".pfm"):
+        rgb = hdr.read_hdr(path) if kind == ".hdr" else hdr.read_pfm(path)
         whole = (0, 0, rgb.shape[1], rgb.shape[0])
         return LayeredPicture(path, (Layer(BEAUTY, ("R", "G", "B"), _planes(rgb), "colour", whole, whole),), True)
     if kind in (".tif", ".tiff"):
@@ -104,7 +104,7 @@ def read_frame(path: Path) -> LayeredPicture | None:
         return LayeredPicture(
             path, tuple(layers), True, notes=("A TIFF of floating-point numbers was taken as linear.",)
         )
-    raise refuse(path, f"a file ending in '{kind}'", "an .exr, .hdr or .tif", "Read it as a picture")
+    raise refuse(path, f"a file ending in '{kind}'", "an .exr, .hdr, .pfm or .tif", "Read it as a picture")
 
 
 def frame_of(picture: Picture) -> LayeredPicture:

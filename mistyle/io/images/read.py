@@ -216,6 +216,12 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         (b"<?xml", "an XML file"),
         (b"%pdf", "a PDF"),
         (b"8bps", "a Photoshop file"),
+        (b"sdpx", "a DPX picture"),
+        (b"xpds", "a DPX picture"),
+        (b"\x80\x2a\x5f\xd7", "a Cineon picture"),
+        (b"dds ", "a DDS texture"),
+        (b"\0\0\0\x0cjp", "a JPEG 2000 picture"),
+        (b"\0\0\1\0", "an icon"),  # else taken for a TGA, which has no mark
     ):
         if head.startswith(mark) or (mark == b"<svg" and b"<svg" in head):
             raise refuse(where, name, EXPECTED, "Export it as PNG from the program that made it")

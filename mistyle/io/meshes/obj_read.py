@@ -18,6 +18,7 @@ from mistyle.io.sandbox.nearby import decoded, mesh_folders, named_file, unmarke
 
 AGAIN = "Export the mesh again as OBJ with triangles or convex polygons"
 STATED = (b"usemtl", b"o", b"g")  # statements that hold for all faces until the next one
+NAMED = ("vertex", "texture coordinate", "normal")  # by a corner of a face, in this order
 LINES = {b"l", b"p"}
 FREE_FORM = {b"vp", b"cstype", b"deg", b"bmat", b"step", b"curv", b"curv2", b"surf", b"parm", b"trim", b"hole", b"scrv"}
 FREE_FORM |= {b"sp", b"end", b"con", b"bzp", b"bsp", b"cdc", b"cdp", b"res"}
@@ -37,7 +38,8 @@ def read_obj(path: Path, max_faces: int) -> Raw:
         fix = "Export the mesh with its faces"
         raise refuse(path, f"{len(positions)} vertices and no faces", "at least one triangle", fix)
     too_many(len(positions), 3 * max_faces, path, "vertices")
-    corners, sizes = _corners(lines, path, max_faces)
+    corners, sizes, absent = _corners(lines, path, max_faces)
+    notes += [f"The faces name {kinds} but the file has none; they were ignored." for kinds in absent]
     small = int((sizes < 3).sum())
     if small:
         notes.append(f"{small} face(s) with fewer than three corners were left out.")
@@ -135,8 +137,9 @@ def _colours(lines: list[bytes], path: Path) -> Float[np.ndarray, "v 3"] | None:
 
 def _corners(
     lines: dict[bytes, list], path: Path, max_faces: int
-) -> tuple[Int[np.ndarray, "c 3"], Int[np.ndarray, " p"]]:
-    """Vertex, texture and normal index (from 0; -1 where missing) of every polygon corner, and corners per polygon."""
+) -> tuple[Int[np.ndarray, "c 3"], Int[np.ndarray, " p"], list[str]]:
+    """Vertex, texture and normal index (from 0; -1 where missing) of every polygon corner, corners per polygon, and
+    what the faces name although the file has none of it."""
     faces = lines[b"f"]
     too_many(len(faces), max_faces, path)
     tokens = [line.split() for line in faces]
@@ -154,18 +157,20 @@ def _corners(
         raise refuse(path, f"a face that is not indices ({str(error)[:80]})", "f v/vt/vn ...", AGAIN) from error
     index = np.pad(index.astype(np.int64), ((0, 0), (0, 3 - index.shape[1]))) if index.shape[1] < 3 else index[:, :3]
     counts = [len(lines[k]) for k in (b"v", b"vt", b"vn")]
+    absent = [k for k in (1, 2) if counts[k] == 0 and index[:, k].any()]
+    index[:, absent] = 0
     if (index < 0).any():
         before = np.repeat(np.array(lines[b"counts"]).reshape(-1, 3), sizes, axis=0)
         index = np.where(index < 0, before + index + 1, index)
         index[index < 0] = 2**31
-    for column, (count, label) in enumerate(zip(counts, ("vertex", "texture coordinate", "normal"), strict=True)):
+    for column, (count, label) in enumerate(zip(counts, NAMED, strict=True)):
         top = int(index[:, column].max(initial=0))
         if top > count:
             shown = "before the first" if top == 2**31 else top
             raise refuse(path, f"a face that uses {label} {shown}", f"1 to {count}", AGAIN)
     if (index[:, 0] == 0).any():
         raise refuse(path, "a face that uses vertex 0", f"1 to {counts[0]}", AGAIN)
-    return index - 1, sizes
+    return index - 1, sizes, [f"{NAMED[k]}s" for k in absent]
 
 
 def _pick(table: Float[np.ndarray, "n w"], index: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 w"] | None:

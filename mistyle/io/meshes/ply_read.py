@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive
+from mistyle.core.errors import InputRefused
 from mistyle.io.images.read import Budget, named_texture
 from mistyle.io.meshes.parsed_mesh import Maps, Raw, RawMap, RawMaterial
 from mistyle.io.meshes.polygons import check_indices, check_positions, parse_numbers, too_many, triangulate
@@ -54,7 +55,7 @@ def read_ply(path: Path, max_faces: int) -> Raw:
     list texcoord); pictures of `comment TextureFile` (several by the faces' texnumber); colours of vertices or faces,
     which are the albedo where no picture is.
     """
-    header, elements, tables = _tables(path, max_faces)
+    header, elements, tables, surplus = _tables(path, max_faces)
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     positions = _positions(vertex, path)
     sizes, corners = _polygons(tables)
@@ -73,7 +74,7 @@ def read_ply(path: Path, max_faces: int) -> Raw:
             normals = np.stack([vertex[k].astype(np.float32) for k in ("nx", "ny", "nz")], axis=1)[triangles]
     polygon = np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))
     raw = plain_mesh("ply", positions, triangles, normals, _ply_uvs(vertex, face, sizes, triangles, pick))
-    raw, notes = _textured(raw, texture_files(header), face, polygon, path), small_faces(sizes)
+    raw, notes = _textured(raw, texture_files(header), face, polygon, path), surplus + small_faces(sizes)
     colours = _colours(tables, elements, triangles, polygon)
     if colours is not None:
         colours, materials, colour_notes = coloured(colours, raw.material, raw.materials)
@@ -83,23 +84,24 @@ def read_ply(path: Path, max_faces: int) -> Raw:
 
 def read_ply_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """The finite vertices of a PLY, with or without faces; at most MAX_POINTS."""
-    _, _, tables = _tables(path, MAX_POINTS // 3)
+    tables = _tables(path, MAX_POINTS // 3)[2]
     points = _positions(tables.get("vertex", {}), path)
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _tables(path: Path, max_faces: int) -> tuple[bytes, list[_PlyElement], dict[str, dict]]:
-    """Header, elements, and the values of each element's properties."""
+def _tables(path: Path, max_faces: int) -> tuple[bytes, list[_PlyElement], dict[str, dict], list[str]]:
+    """Header, elements, the values of each element's properties, and notes."""
     data = read_bytes(path)
     data = unmarked(data) if data.startswith(b"\xef\xbb\xbf") else data
     elements, form, start = _ply_header(data, path)
     for element in elements:
         limit = max_faces if element.name == "face" else 3 * max_faces
         too_many(element.count, limit, path, f"elements '{element.name}'")
-    tables = (
-        _ply_ascii(data[start:], elements, path) if form == "ascii" else _ply_binary(data, start, elements, form, path)
-    )
-    return data[:start], elements, tables
+    if form == "ascii":
+        tables, notes = _ply_ascii(data[start:], elements, path)
+    else:
+        tables, notes = _ply_binary(data, start, elements, form, path), []
+    return data[:start], elements, tables, notes
 
 
 def _positions(vertex: dict, path: Path) -> Float[np.ndarray, "v 3"]:
@@ -243,8 +245,39 @@ def _ply_header(data: bytes, path: Path) -> tuple[list[_PlyElement], str, int]:
     return elements, form, end.end()
 
 
-def _ply_ascii(data: bytes, elements: list[_PlyElement], path: Path) -> dict[str, dict]:
+def _ply_ascii(data: bytes, elements: list[_PlyElement], path: Path) -> tuple[dict[str, dict], list[str]]:
+    """The values, however lines are broken. Where they are not as many as the header describes, each element's line is
+    read by itself (MeshLab wrote faces with more numbers than its header describes)."""
     numbers = parse_numbers(data, path, "its data")
+    try:
+        return _ply_columns(numbers, elements, path), []
+    except InputRefused:
+        rows = [row for row in data.splitlines() if row.strip()]
+        if len(rows) != sum(element.count for element in elements):
+            raise
+    described = [element for element in elements for _ in range(element.count)]
+    kept = [_described(row.split(), element, path) for row, element in zip(rows, described, strict=True)]
+    longer = sum(len(row.split()) > len(own) for row, own in zip(rows, kept, strict=True))
+    tables = _ply_columns(
+        parse_numbers(b" ".join(token for own in kept for token in own), path, "its data"), elements, path
+    )
+    return tables, [f"{longer} lines have more numbers than the header describes; the last ones were ignored."]
+
+
+def _described(row: list[bytes], element: _PlyElement, path: Path) -> list[bytes]:
+    """The first tokens of an element's line, as many as its properties take."""
+    at = 0
+    for p in element.properties:
+        length = row[at] if p.count and at < len(row) else b"0"
+        if not length.isdigit():
+            raise refuse(path, f"a list of {length[:40]!r} values in an element '{element.name}'", "a count", CUT_OFF)
+        at += 1 + int(length)
+    if at > len(row):
+        raise refuse(path, f"a line of {len(row)} numbers", f"{at} of an element '{element.name}'", CUT_OFF)
+    return row[:at]
+
+
+def _ply_columns(numbers: Float[np.ndarray, " n"], elements: list[_PlyElement], path: Path) -> dict[str, dict]:
     tables, at = {}, 0
     for element in elements:
         if all(p.count is None for p in element.properties):
@@ -259,6 +292,8 @@ def _ply_ascii(data: bytes, elements: list[_PlyElement], path: Path) -> dict[str
             at += element.count * width
         else:
             tables[element.name], at = _ply_rows(element, numbers, at, path)
+    if at < len(numbers):
+        raise refuse(path, f"{len(numbers)} numbers", f"{at}, as its header describes", AGAIN)
     return tables
 
 

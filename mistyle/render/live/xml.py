@@ -4,6 +4,7 @@ Mitsuba's own parser reads the file, with includes, defaults and paths. The writ
 fitted elements replaced: comments, ids and structure stay.
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -72,7 +73,9 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
             instances = mi.parser.instantiate(config, _parsed(config, file, parameters)[0])
     except RuntimeError as error:
         stopping.check()
-        raise InputRefused(f"{file}: Mitsuba cannot load this scene. {error}") from error
+        unset = re.search(r"undefined parameter: \$(\w+)", str(error))
+        fix = f" Give it a value: -D {unset[1]}=VALUE." if unset else ""
+        raise InputRefused(f"{file}: Mitsuba cannot load this scene. {error}{fix}") from error
     scene: Any = instances[0] if isinstance(instances, list) else instances
     if not isinstance(scene, mi.Scene):
         raise InputRefused(f"{file}: holds a {type(scene).__name__}, not a scene.")

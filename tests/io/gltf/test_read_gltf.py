@@ -370,6 +370,7 @@ BROKEN = {
     "attribute counts": (edit("accessors", 1, "count", to=3), "one number for all"),
     "infinite transform": (edit("nodes", 0, "scale", to=[1e308, 1e308, 1e308]), "not finite"),
     "version": (edit("asset", "version", to="1.0"), "2.0"),
+    "glTF 1.0": (edit("accessors", to={"accessor_0": {}}), "glTF 1.0"),
     "draco": (edit("extensionsRequired", to=["KHR_draco_mesh_compression"]), "without compression"),
     "meshopt": (edit("extensionsRequired", to=["EXT_meshopt_compression"]), "without compression"),
     "unknown": (edit("extensionsRequired", to=["ACME_holograms"]), "ACME_holograms"),

@@ -263,6 +263,11 @@ REFUSED = {
     "a.heic": (b"\0\0\0\x18ftypheic", "HEIC"),
     "a.exr": (b"\x76\x2f\x31\x01\x02\0\0\0", "high-dynamic-range"),
     "a.psd": (b"8BPS\0\x01", "Photoshop"),
+    "a.dpx": (b"SDPX" + bytes(2000), "DPX"),
+    "a.cin": (b"\x80\x2a\x5f\xd7" + bytes(2000), "Cineon"),
+    "a.dds": (b"DDS " + bytes(200), "DDS"),
+    "a.jp2": (b"\0\0\0\x0cjP  \r\n\x87\n", "JPEG 2000"),
+    "a.ico": (b"\0\0\1\0\1\0" + bytes(200), "icon"),
 }
 
 

@@ -222,7 +222,7 @@ BROKEN_OBJ = {
     "f 0 1 2": "vertex 0",
     "f -9 1 2": "before the first",
     "f 1/7 2/2 3/3": "texture coordinate 7",
-    "f 1//1 2//1 3//1": "normal 1",
+    "vn 0 0 1\nf 1//2 2//1 3//1": "normal 2",
     "f a b c": "a face that is not indices",
     "v 1 2\nf 1 2 3": "2 numbers",
     "v 1 x 2\nf 1 2 3": "'x'",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.geometry.retexture import fetch
 from mistyle.io.meshes.obj_read import read_obj
@@ -223,3 +224,54 @@ def test_strips_of_ply(strip: str, tmp_path: Path) -> None:
     head += "element tristrips 2\nproperty list int int vertex_indices\nend_header\n"
     (tmp_path / "a.ply").write_text(head + "\n".join([*POINTS, strip, "3 1 2 3"]) + "\n")
     assert read_ply(tmp_path / "a.ply", 10).faces.tolist() == [*STRIPS[strip], [1, 2, 3]]
+
+
+def face_rows(row: str, count: int = 2) -> str:
+    head = "ply\nformat ascii 1.0\nelement vertex 4\n" + "".join(f"property float {n}\n" for n in "xyz")
+    head += f"element face {count}\nproperty list uchar int vertex_indices\nproperty uchar red\nend_header\n"
+    return head + "\n".join(POINTS) + "\n" + row.format(*[" ".join(map(str, (3, *face))) for face in FACES])
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ("{0} 9\n{1} 9\n", ""),
+        ("{0}\n9 {1}\n9", ""),  # lines broken elsewhere
+        ("{0} 9 4 1 1 1 1\n\n{1} 9 2 1 1\n", "2 lines have more numbers than the header describes"),
+        ("{0} 9 1\n{1} 9\n", "1 lines have more numbers than the header describes"),
+    ],
+)
+def test_rows_of_ascii_ply(rows: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_text(face_rows(rows))
+    raw = read_ply(tmp_path / "a.ply", 10)
+    assert raw.faces.tolist() == FACES and told in " ".join(raw.notes)
+    assert bool(told) == any("header describes" in note for note in raw.notes)
+
+
+@pytest.mark.parametrize(
+    ("rows", "found"),
+    [
+        ("{0} 9\n{1}\n", "a line of 4 numbers"),
+        ("{0} 9\n{1} 9\n5 5\n", "numbers"),  # a line too many
+        ("{0} 9 {1} 9 5\n", "numbers"),
+        ("{0} 9 9\nx{1}\n", "'x3'"),
+        ("{0} 9 9\n-{1} 9\n", "a list of"),
+    ],
+)
+def test_ascii_ply_that_is_not_as_described_is_refused(rows: str, found: str, tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_text(face_rows(rows))
+    with pytest.raises(InputRefused, match=found):
+        read_ply(tmp_path / "a.ply", 10)
+
+
+@pytest.mark.parametrize("corner", ["{0}//{0}", "{0}/{0}", "{0}/{0}/{0}", "-{0}//-{0}"])
+def test_faces_of_obj_may_name_what_the_file_lacks(corner: str, tmp_path: Path) -> None:
+    numbers = (4, 3, 2) if corner.startswith("-") else (1, 2, 3)
+    vertices = "".join(f"v {point}\n" for point in POINTS)
+    (tmp_path / "a.obj").write_text(f"{vertices}f {' '.join(corner.format(n) for n in numbers)}\n")
+    raw = read_obj(tmp_path / "a.obj", 10)
+    assert raw.faces.tolist() == FACES[:1] and raw.normals is None and raw.uvs is None
+    assert "the file has none" in raw.notes[0]
+    (tmp_path / "a.obj").write_text(f"{vertices}vt 0 0\nvn 0 0 1\nf 1/2/1 2/1/1 3/1/1\n")
+    with pytest.raises(InputRefused, match="texture coordinate 2"):
+        read_obj(tmp_path / "a.obj", 10)

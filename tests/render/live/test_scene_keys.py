@@ -185,6 +185,9 @@ def test_a_file_that_is_no_scene_is_refused(folder, tmp_path):
     (tmp_path / "bad.xml").write_text('<scene version="3.0.0"><shape type="nothing"/></scene>', encoding="utf-8")
     with pytest.raises(InputRefused, match="Mitsuba cannot load this scene"):
         scene_xml.load_scene_for_fit(tmp_path / "bad.xml")
+    (tmp_path / "open.xml").write_text('<scene version="3.0.0"><integer name="x" value="$spp"/></scene>')
+    with pytest.raises(InputRefused, match="-D spp=VALUE"):
+        scene_xml.load_scene_for_fit(tmp_path / "open.xml")
     with pytest.raises(InputRefused, match="unused"):
         scene_xml.load_scene_for_fit(folder / "scene.xml", {"sise": 3})
 
