@@ -53,13 +53,14 @@ def read_exposure(path: Path) -> tuple[float, float, float]:
     return seconds, f_number, iso
 
 
-def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
+def read_exr(path: Path, colours: bool = False) -> dict[str, Float[np.ndarray, "h w"]]:
     """The channels of an OpenEXR file by full name ("R", "normal.X"), float32, display window, row 0 at the top.
 
     The header is checked before decoding: windows, number of channels, texels. All parts of a file are read, with their
-    names before the channels'. Deep files and subsampled channels are refused.
+    names before the channels'. Deep files and subsampled channels are refused; with `colours` also files whose header
+    names other primaries than those of Rec.709.
     """
-    return {name: np.asarray(plane, np.float32) for name, plane in ask("exr", Path(path)).items()}
+    return {name: np.asarray(plane, np.float32) for name, plane in ask("exr", Path(path), colours).items()}
 
 
 def read_frame(path: Path) -> LayeredPicture:

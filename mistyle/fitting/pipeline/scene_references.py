@@ -46,7 +46,7 @@ def read_reference(
     from mistyle.io.read import read_exr, read_picture
 
     if path.suffix.lower() == ".exr":
-        planes = read_exr(path)
+        planes = read_exr(path, colours=True)
         names, notes = choose_channels(path, planes, channels)
         rgb = np.stack([planes[c] for c in names], axis=-1)
         if names[0].rpartition(".")[2] == "X":

@@ -444,7 +444,7 @@ def _decoded(
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, Bool[np.ndarray, "h w"]]:
     """Linear colours (still premultiplied in an EXR), alpha, and the mask of finite, unsaturated pixels."""
     if shot.picture.suffix.lower() == ".exr":
-        planes = read_exr(shot.picture)
+        planes = read_exr(shot.picture, colours=True)
         if not {"R", "G", "B"} <= set(planes):
             found = f"channels {', '.join(sorted(planes))[:200]}"
             raise refuse(shot.picture, found, "R, G and B", "Write the colours as R, G, B")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from mistyle.io.images.write import REC709_CHROMATICITIES
 from mistyle.io.sandbox.bounds import MAX_PIXELS, read_bytes, refuse
 
 MAX_CHANNELS = 256
@@ -19,9 +20,13 @@ RGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], 
 EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
-def read_exr(path: Path) -> dict[str, Shaped[np.ndarray, "h w"]]:
+def read_exr(path: Path, colours: bool = False) -> dict[str, Shaped[np.ndarray, "h w"]]:
     """See io/read.py; in the file's own precision."""
     parts = parts_of_exr(path)
+    found = chromaticities(parts[0].header, path)
+    if colours and not np.allclose(found, REC709_CHROMATICITIES, atol=2e-3):
+        numbers = " ".join(f"{v:.4f}" for v in found)
+        raise refuse(path, f"colours of other primaries ({numbers})", "linear Rec.709", "Convert it, or export it so")
     planes: dict[str, np.ndarray] = {}
     for part in parts:
         prefix = f"{part.header['name']}." if len(parts) > 1 and part.header.get("name") else ""
@@ -41,6 +46,18 @@ def colour_of_exr(path: Path) -> Float[np.ndarray, "h w 3"]:
     names = [f"{layer}{c}" for c in "RGB"] if layer is not None else ["Y" if "Y" in planes else sorted(planes)[0]] * 3
     colour = np.stack([planes[name] for name in names], axis=-1).astype(np.float32)
     return np.nan_to_num(colour, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def chromaticities(header: dict[str, Any], path: Path) -> tuple[float, ...]:
+    """(x, y) of red, green, blue and white; those of Rec.709 without an entry."""
+    entry = header.get("chromaticities")
+    if entry is None:
+        return REC709_CHROMATICITIES
+    try:
+        values = tuple(float(v) for pair in entry for v in (pair if np.ndim(pair) else [pair]))
+    except (TypeError, ValueError) as error:
+        raise refuse(path, f"chromaticities of type {type(entry).__name__}", "eight numbers", AGAIN) from error
+    return values if len(values) == 8 else REC709_CHROMATICITIES
 
 
 def size_of_exr(path: Path) -> tuple[int, int]:

@@ -16,12 +16,12 @@ from mistyle.core.asset import Picture
 from mistyle.io.images import hdr
 from mistyle.io.images.float_tiff import read_float_tiff
 from mistyle.io.images.quantisation import linear_rows
+from mistyle.io.images.write import REC709_CHROMATICITIES
 from mistyle.io.sandbox.bounds import refuse
 
 BEAUTY = "beauty"
 # Renderers' names of the finished picture, which is matched across renderers as one layer.
 BEAUTY_NAMES = {"", "beauty", "combined", "rgba", "rgb", "color", "colour", "composite"}
-REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 AGAIN = "Write or copy it again"
 Window = tuple[int, int, int, int]
 
@@ -75,7 +75,7 @@ class LayeredPicture:
     path: Path
     layers: tuple[Layer, ...]
     high: bool
-    chromaticities: tuple[float, ...] = REC709
+    chromaticities: tuple[float, ...] = REC709_CHROMATICITIES
     notes: tuple[str, ...] = ()
 
     def layer(self, name: str) -> Layer | None:
@@ -136,7 +136,7 @@ def _read_exr(path: Path) -> LayeredPicture:
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
         raise refuse(path, f"two layers called {duplicates[0]!r}", "names that tell layers apart", "Rename one of them")
-    return LayeredPicture(path, tuple(layers), True, _chromaticities(parts[0].header, path))
+    return LayeredPicture(path, tuple(layers), True, hdr.chromaticities(parts[0].header, path))
 
 
 def _text(value: Any) -> str:
@@ -198,14 +198,3 @@ def _split(name: str, planes: dict[str, np.ndarray], window: Window, display: Wi
         layer_name = "alpha" if beauty and channel.upper() == "A" else f"{name}.{channel}" if name else channel
         result.append(Layer(layer_name, (channel,), (plane,), "data", window, display))
     return result
-
-
-def _chromaticities(header: dict[str, Any], path: Path) -> tuple[float, ...]:
-    entry = header.get("chromaticities")
-    if entry is None:
-        return REC709
-    try:
-        values = tuple(float(v) for pair in entry for v in (pair if np.ndim(pair) else [pair]))
-    except (TypeError, ValueError) as error:
-        raise refuse(path, f"chromaticities of type {type(entry).__name__}", "eight numbers", AGAIN) from error
-    return values if len(values) == 8 else REC709

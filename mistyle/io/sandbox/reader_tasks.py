@@ -83,8 +83,8 @@ def _tiles(material: RawMaterial, uvs: Float[np.ndarray, "f 3 2"] | None) -> dic
     return loaded
 
 
-def exr(path: Path) -> dict[str, np.ndarray]:
-    return hdr.read_exr(path)
+def exr(path: Path, colours: bool) -> dict[str, np.ndarray]:
+    return hdr.read_exr(path, colours)
 
 
 def frame(path: Path) -> Any:
@@ -98,13 +98,22 @@ def radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
     if kind not in (".exr", ".hdr"):
         raise refuse(path, f"a file ending in '{kind}'", "an .exr or .hdr environment map", "Convert it to one of them")
     if kind == ".hdr":
-        return hdr.read_hdr(path)
-    planes = hdr.read_exr(path)
+        return _around(hdr.read_hdr(path), path)
+    planes = hdr.read_exr(path, colours=True)
     if not {"R", "G", "B"} <= set(planes):
         raise refuse(path, f"channels {', '.join(sorted(planes))[:200]}", "R, G and B", "Write the colours as R, G, B")
     values = np.stack([planes[c] for c in "RGB"], axis=-1).astype(np.float32)
     if not np.isfinite(values).all() or values.min() < 0:
         raise refuse(path, "radiance that is negative, NaN or infinite", "finite radiance >= 0", "Write it again")
+    return _around(values, path)
+
+
+def _around(values: Float[np.ndarray, "h w 3"], path: Path) -> Float[np.ndarray, "h w 3"]:
+    """The values, if their shape can be that of a latitude-longitude map; cube maps and mirror balls have others."""
+    height, width = values.shape[:2]
+    if not 1.8 < width / height < 2.2:
+        found = f"a picture of {width} x {height} pixels"
+        raise refuse(path, found, "a latitude-longitude map, twice as wide as high", "Convert it to one")
     return values
 
 
