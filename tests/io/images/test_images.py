@@ -1,14 +1,21 @@
 """Pictures read back by readers that are not ours: Pillow (PNG, 8 bits), OpenCV (16 bits), OpenEXR's own reader."""
 
 import io
+import json
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from mistyle.core.errors import MistyleError
+from mistyle.core.camera import orbit
+from mistyle.core.errors import InputRefused, MistyleError
+from mistyle.fitting.pipeline.scene_references import read_reference
+from mistyle.io.cameras.camera_files import camera_entry
+from mistyle.io.cameras.captures import read_captures
+from mistyle.io.images.ocio import KNOWN
 from mistyle.io.images.write import LINEAR_REC709, REC709_CHROMATICITIES, encode_png, write_exr, write_png
+from mistyle.io.read import read_exr, read_radiance
 
 
 @pytest.mark.parametrize("channels", [(), (3,), (4,)])
@@ -108,3 +115,45 @@ def test_a_full_disk_is_a_sentence(monkeypatch, tmp_path):
         with pytest.raises(MistyleError, match="disk is full"):
             write()
     assert list(tmp_path.iterdir()) == []
+
+
+ACES = {"colorInteropID": "lin_ap1_scene", "chromaticities": KNOWN["lin_ap1_scene"][1]}
+COLOURS = {
+    "an environment": read_radiance,
+    "a reference of a scene": read_reference,
+    "a reference of a mesh": lambda path: captured(path.parent),
+}
+
+
+def captured(folder):
+    entry = camera_entry(orbit(0.0, 0, distance=5.0, fov=30.0, size=(8, 16))) | {"exr": "a.exr"}
+    (folder / "camera.json").write_text(json.dumps({"views": [entry]}))
+    lamp = {"type": "directional", "direction": [0, 1, 0], "irradiance": [3, 3, 3]}
+    (folder / "lights.json").write_text(json.dumps({"lights": [lamp]}))
+    return read_captures(folder).load(0)
+
+
+@pytest.mark.parametrize("kind", COLOURS)
+def test_colours_of_other_primaries_are_refused(tmp_path, rng, kind):
+    planes = {c: rng.random((8, 16)).astype(np.float32) for c in "RGB"}
+    write_exr(tmp_path / "a.exr", planes)
+    COLOURS[kind](tmp_path / "a.exr")
+    write_exr(tmp_path / "a.exr", planes, attributes=ACES)
+    with pytest.raises(InputRefused, match=r"a\.exr: found colours of other primaries \(0.7130 .*Rec.709"):
+        COLOURS[kind](tmp_path / "a.exr")
+    assert set(read_exr(tmp_path / "a.exr")) == set("RGB")
+
+
+@pytest.mark.parametrize("ending", [".exr", ".hdr"])
+@pytest.mark.parametrize(("shape", "right"), [((8, 16), True), ((8, 17), True), ((16, 16), False), ((48, 8), False)])
+def test_an_environment_is_twice_as_wide_as_high(tmp_path, ending, shape, right):
+    path, values = tmp_path / f"a{ending}", np.ones(shape, np.float32)
+    if ending == ".exr":
+        write_exr(path, dict.fromkeys("RGB", values))
+    else:
+        cv2.imwrite(str(path), np.dstack([values] * 3))
+    if right:
+        assert read_radiance(path).shape == (*shape, 3)
+    else:
+        with pytest.raises(InputRefused, match=f"{shape[1]} x {shape[0]} pixels; expected a latitude-longitude map"):
+            read_radiance(path)
