@@ -24,6 +24,7 @@ from mistyle.core import errors
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.core.paths import PACKAGE
 from mistyle.io.sandbox import rpc_codec, shared_copy
+from mistyle.io.sandbox.asset_folders import ASSETS
 from mistyle.io.sandbox.bounds import MAX_FILE_BYTES, refuse
 
 MEMORY = 2 << 30
@@ -124,7 +125,7 @@ class Reader:
         timer.start()
         try:
             request = {"task": task, "cwd": os.getcwd(), "limits": _bounds(), "memory": memory, "seconds": seconds}
-            request["may_lend"] = self.lends
+            request |= {"may_lend": self.lends, "assets": os.environ.get(ASSETS, "")}
             rpc_codec.send(self.input.write, (path, *arguments), **request)  # type: ignore[arg-type]
             value, head = rpc_codec.receive(self.output.readinto, self._copy)  # type: ignore[attr-defined]
             if self.borrowed:
