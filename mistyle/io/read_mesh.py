@@ -1,12 +1,13 @@
 """Reader of all mesh files that come from outside, and of the files that they name; bounded.
 
 Unusable files are refused (core/errors.py InputRefused) with the file, the content found, the content expected and the
-fix. Only files in a mesh's own folder are opened, and pictures in the folder `textures` beside it. No repair is silent:
-`Source.notes` lists the changes.
+fix. Only files in a mesh's own folder are opened, pictures in the folder `textures` beside it, and files in a folder of
+MISTYLE_ASSETS that holds the mesh (io/sandbox/asset_folders.py). No repair is silent: `Source.notes` lists the changes.
 
 Files are opened and decoded in the reader process (io/sandbox/reader_process.py), as in `read.py`.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,8 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset, UpAxis
 from mistyle.io.meshes.parsed_mesh import Extent, Raw, spelled
-from mistyle.io.sandbox.bounds import refuse
+from mistyle.io.sandbox.asset_folders import ASSETS
+from mistyle.io.sandbox.bounds import USD, refuse
 from mistyle.io.sandbox.reader_process import ask
 
 MESHES = {
@@ -83,7 +85,10 @@ def _raw(path: Path, max_faces: int) -> Raw:
         raise refuse(path, found, f"one of {' '.join(MESHES)}", "Export the mesh as .glb or .obj")
     from mistyle.io.meshes.polygons import check_indices
 
-    raw = spelled(ask("mesh", path, MESHES[kind], max_faces))
+    more = read_usd_files(path) if kind in USD else []
+    if os.environ.get(ASSETS) and path.is_file() and kind not in USD:
+        more = read_references(path)
+    raw = spelled(ask("mesh", path, MESHES[kind], max_faces, more=more))
     check_indices(raw.faces, len(raw.positions), path, "vertex")
     return raw
 
@@ -104,7 +109,7 @@ def read_extent(
 
 
 def read_usd_files(path: Path) -> list[Path]:
-    """The files that a USD file depends on: its layers, packages and textures in its own folder."""
+    """The files that a USD file depends on: its layers, packages, documents and textures."""
     return [Path(file) for file in ask("usd_files", Path(path))]
 
 

@@ -70,7 +70,8 @@ def remedy(mesh: Path, target: Path, first: str, last: Sequence[str] = ()) -> st
     wide = (Path(folder.anchor), home, *home.parents, *temporary)
     common = next((place for place in (folder, *folder.parents) if target.is_relative_to(place)), wide[0])
     if target.is_file() and common not in wide:
-        value = os.pathsep.join([*filter(None, _value().split(os.pathsep)), str(common)])
+        others = [entry for entry in _value().split(os.pathsep) if entry and not Path(entry).is_relative_to(common)]
+        value = os.pathsep.join([*others, str(common)])
         fixes.append(f"set {ASSETS}={value} (meshes there may name each other's files)")
     fixes += last
     return fixes[0] if len(fixes) == 1 else f"{', '.join(fixes[:-1])}, or {fixes[-1]}"

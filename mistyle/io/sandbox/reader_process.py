@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -180,13 +181,14 @@ class Reader:
             self.process.wait()
 
 
-def ask(task: str, path: Path, *arguments: Any) -> Any:
+def ask(task: str, path: Path, *arguments: Any, more: Sequence[Path] = ()) -> Any:
     """The result of `task` (io/sandbox/reader_tasks.py) for the file at `path`, decoded in the child.
 
     Raises the task's own errors (InputRefused and related, with their messages). InputRefused where the child crashed,
-    hung or ran out of memory over the file; EnvironmentMissing where no child can be started.
+    hung or ran out of memory over the file; EnvironmentMissing where no child can be started. `more` are the files that
+    it names: the limits count them, too.
     """
-    size = _size(path)
+    size = min(sum(map(_size, {path, *more})), MAX_FILE_BYTES)
     with _lock:
         # A child that has served before may have fragmented memory: the request is repeated in a new one.
         for fresh in (_running().served == 0, True):

@@ -45,7 +45,14 @@ CALLS = {
     *(("torch", "load"), ("pickle", "load"), ("pickle", "loads"), ("yaml", "safe_load"), ("library", "safe_load")),
     *(("yaml", "load"), ("tomllib", "load"), ("tomllib", "loads"), ("mi", "load_file"), ("np", "memmap")),
     *(("ElementTree", "parse"), ("ElementTree", "fromstring"), ("zipfile", "ZipFile"), ("np", "loadtxt")),
-    *(("trimesh", "load"), ("imageio", "imread"), ("Stage", "Open"), ("json", "load"), ("xatlas", "parse_mesh")),
+    *(
+        ("trimesh", "load"),
+        ("imageio", "imread"),
+        ("Stage", "Open"),
+        ("json", "load"),
+        ("xatlas", "parse_mesh"),
+        ("mx", "readFromXmlString"),
+    ),
 }
 DECODERS = {
     *(
@@ -61,7 +68,7 @@ DECODERS = {
     *("io/gltf/check", "io/gltf/materials", "io/cameras/colmap", "io/cameras/metashape", "io/cameras/realityscan"),
     *("io/sandbox/references", "io/sandbox/reader_tasks"),
     *("io/usd/read", "io/usd/layers", "io/usd/materials", "io/meshes/mtl_read", "io/meshes/ply_read"),
-    *("io/gltf/pose", "io/usd/stage", "io/usd/mesh"),
+    *("io/gltf/pose", "io/usd/stage", "io/usd/mesh", "io/usd/mtlx"),
 }
 ALLOWED = {
     "setup/environment": "pyproject.toml of the clone",
