@@ -7,9 +7,9 @@ MISTYLE_ASSETS that holds the mesh (io/sandbox/asset_folders.py). No repair is s
 Files are opened and decoded in the reader process (io/sandbox/reader_process.py), as in `read.py`.
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.asset import Asset, UpAxis
+from mistyle.core.paths import real_path
 from mistyle.io.meshes.parsed_mesh import Extent, Raw, spelled
-from mistyle.io.sandbox.asset_folders import ASSETS
 from mistyle.io.sandbox.bounds import USD, refuse
 from mistyle.io.sandbox.reader_process import ask
 
@@ -85,12 +85,16 @@ def _raw(path: Path, max_faces: int) -> Raw:
         raise refuse(path, found, f"one of {' '.join(MESHES)}", "Export the mesh as .glb or .obj")
     from mistyle.io.meshes.polygons import check_indices
 
-    more = read_usd_files(path) if kind in USD else []
-    if os.environ.get(ASSETS) and path.is_file() and kind not in USD:
-        more = read_references(path)
-    raw = spelled(ask("mesh", path, MESHES[kind], max_faces, more=more))
+    raw = spelled(ask("mesh", path, MESHES[kind], max_faces, more=partial(_others, path)))
     check_indices(raw.faces, len(raw.positions), path, "vertex")
     return raw
+
+
+def _others(path: Path) -> list[Path]:
+    """The other files that a mesh file names."""
+    if path.suffix.lower() not in USD:
+        return read_references(path)
+    return [file for file in read_usd_files(path) if file != real_path(path)]
 
 
 def read_extent(

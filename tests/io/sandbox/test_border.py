@@ -291,6 +291,25 @@ def test_a_file_that_takes_too_much_memory_is_refused(tmp_path: Path):
     assert done.returncode == 0, done.stderr
 
 
+def test_the_files_that_a_mesh_names_count_once_memory_runs_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name, size in (("a.usda", 10), ("b.usdc", 1_000)):
+        (tmp_path / name).write_bytes(b"x" * size)
+    sizes: list[int] = []
+
+    def limited(task: str, path: Path, arguments: tuple, size: int) -> str:
+        sizes.append(size)
+        if size < 1_010:
+            raise reader_process.OutOfMemory
+        return "read"
+
+    monkeypatch.setattr(reader_process, "_limited", limited)
+    assert reader_process.ask("mesh", tmp_path / "a.usda", more=lambda: [tmp_path / "b.usdc"]) == "read"
+    assert sizes == [10, 1_010]
+    for others in ([], [tmp_path / "a.usda"]):
+        with pytest.raises(InputRefused, match="a file whose decoding takes more than"):
+            reader_process.ask("mesh", tmp_path / "a.usda", more=lambda others=others: others)
+
+
 def test_threads_share_the_child(tmp_path: Path):
     for k in range(8):
         write_exr(tmp_path / f"{k}.exr", {"Z": np.full((50, 60), k, np.float32)})
