@@ -22,6 +22,7 @@ from typing import Any
 from mistyle.batch.plan import PLAN, BatchPlan
 from mistyle.batch.shard import SHARDS
 from mistyle.core.errors import EnvironmentMissing, MistyleError
+from mistyle.io.sandbox.asset_folders import ASSETS
 from mistyle.process.children import PARENT
 
 # Exit codes of crashes: a shell reports a signal as 128 + its number.
@@ -306,7 +307,8 @@ def _on_ray(
     begun = {index: _begun_file(plan, index) for index in todo}
     for path in begun.values():
         path.unlink(missing_ok=True)
-    waiting = {task.remote(k, command(plan, k), str(log_of(plan, k)), str(begun[k]), timeout): k for k in todo}
+    assets = os.environ.get(ASSETS, "")  # workers of a running cluster have their own environment
+    waiting = {task.remote(k, command(plan, k), str(log_of(plan, k)), str(begun[k]), timeout, assets): k for k in todo}
     started: set[int] = set()
     ended, since = [], time.monotonic()
     while waiting:
@@ -331,13 +333,16 @@ def _on_ray(
     return ended
 
 
-def _ray_shard(index: int, arguments: list[str], log: str, begun: str, timeout: float | None) -> Ended:
+def _ray_shard(
+    index: int, arguments: list[str], log: str, begun: str, timeout: float | None, assets: str = ""
+) -> Ended:
     """The task of a Ray worker: run the shard's process, with one retry after a crash."""
     Path(begun).parent.mkdir(parents=True, exist_ok=True)
     Path(begun).touch()
 
     def run(plain: bool) -> int:
         with _shard_environment(plain) as environment:
+            environment |= {ASSETS: assets} if assets else {}
             return _wait(_start(arguments, Path(log), environment), timeout)
 
     return _run_with_retry(index, run, timeout)

@@ -1,14 +1,15 @@
 """Reader of all mesh files that come from outside, and of the files that they name; bounded.
 
 Unusable files are refused (core/errors.py InputRefused) with the file, the content found, the content expected and the
-fix. Only files in a mesh's own folder are opened, and pictures in the folder `textures` beside it. No repair is silent:
-`Source.notes` lists the changes.
+fix. Only files in a mesh's own folder are opened, pictures in the folder `textures` beside it, and files in a folder of
+MISTYLE_ASSETS that holds the mesh (io/sandbox/asset_folders.py). No repair is silent: `Source.notes` lists the changes.
 
 Files are opened and decoded in the reader process (io/sandbox/reader_process.py), as in `read.py`.
 """
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,8 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.asset import Asset, UpAxis
+from mistyle.core.paths import real_path
 from mistyle.io.meshes.parsed_mesh import Extent, Raw, spelled
-from mistyle.io.sandbox.bounds import refuse
+from mistyle.io.sandbox.bounds import USD, refuse
 from mistyle.io.sandbox.reader_process import ask
 
 MESHES = {
@@ -83,9 +85,16 @@ def _raw(path: Path, max_faces: int) -> Raw:
         raise refuse(path, found, f"one of {' '.join(MESHES)}", "Export the mesh as .glb or .obj")
     from mistyle.io.meshes.polygons import check_indices
 
-    raw = spelled(ask("mesh", path, MESHES[kind], max_faces))
+    raw = spelled(ask("mesh", path, MESHES[kind], max_faces, more=partial(_others, path)))
     check_indices(raw.faces, len(raw.positions), path, "vertex")
     return raw
+
+
+def _others(path: Path) -> list[Path]:
+    """The other files that a mesh file names."""
+    if path.suffix.lower() not in USD:
+        return read_references(path)
+    return [file for file in read_usd_files(path) if file != real_path(path)]
 
 
 def read_extent(
@@ -104,7 +113,7 @@ def read_extent(
 
 
 def read_usd_files(path: Path) -> list[Path]:
-    """The files that a USD file depends on: its layers, packages and textures in its own folder."""
+    """The files that a USD file depends on: its layers, packages, documents and textures."""
     return [Path(file) for file in ask("usd_files", Path(path))]
 
 

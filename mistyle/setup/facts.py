@@ -174,10 +174,20 @@ def _optional() -> list[Row]:
         missing = [module for module in modules if find_spec(module) is None]
         text = f"not installed: {', '.join(missing)}" if missing else "installed"
         result.append(Row(name, text, "optional" if missing else "ok", f"{pip} {packages}" if missing else ""))
-    result.append(_weights())
+    result += [_weights(), *_asset_folders()]
     node = _words("node", "--version") if shutil.which("node") else ""
     fix = "" if node else "install Node.js (nodejs.org); only the tests' glTF validator uses it"
     return [*result, Row("node", node or "not installed", "ok" if node else "optional", fix)]
+
+
+def _asset_folders() -> list[Row]:
+    """The folders in which meshes may name each other's files; no row without the variable."""
+    entries = [entry.strip() for entry in os.environ.get("MISTYLE_ASSETS", "").split(os.pathsep) if entry.strip()]
+    wrong = [entry for entry in entries if not os.path.isabs(entry) or not os.path.isdir(entry)]
+    fix = f"MISTYLE_ASSETS takes absolute paths of folders, separated by '{os.pathsep}'"
+    if wrong:
+        return [Row("asset folders", f"MISTYLE_ASSETS names no folder: {', '.join(wrong)}", "missing", fix)]
+    return [Row("asset folders", os.pathsep.join(entries), "ok")] if entries else []
 
 
 def _weights() -> Row:

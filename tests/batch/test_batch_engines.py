@@ -20,6 +20,7 @@ from mistyle.batch.pipeline import Choices, planned, run_batch
 from mistyle.batch.plan import PLAN
 from mistyle.batch.shard import marker
 from mistyle.core.paths import scenes
+from mistyle.io.sandbox.asset_folders import ASSETS
 
 
 def plan_in(folder: Path):
@@ -27,6 +28,15 @@ def plan_in(folder: Path):
     text = BATCH.format(mesh=scenes() / "demo.obj", style=scenes() / "demo_style.png")
     jobs.write_text(re.sub("report = {.*?}", 'report = { detail = "none" }', text, count=1))
     return planned(jobs, folder, Choices(workers=2, threads=1))
+
+
+def test_a_shard_on_ray_has_the_asset_folders_of_its_batch(tmp_path, monkeypatch):
+    """A worker of a running cluster has the environment of its machine, not of the command."""
+    monkeypatch.delenv(ASSETS, raising=False)
+    line = [sys.executable, "-c", f"import os; print(os.environ.get('{ASSETS}'))"]
+    for value, shown in (("/show/assets", "/show/assets"), ("", "None")):
+        ended = engines._ray_shard(0, line, str(tmp_path / "log"), str(tmp_path / "begun"), None, value)
+        assert ended.code == 0 and (tmp_path / "log").read_text().strip() == shown
 
 
 def hashes(plan) -> dict[str, str]:

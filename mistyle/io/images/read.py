@@ -3,7 +3,6 @@
 import io
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +15,7 @@ from mistyle.core.asset import Picture, Pixels
 from mistyle.core.errors import InputRefused
 from mistyle.io.images.float_tiff import holds_floats, tags_of_tiff
 from mistyle.io.images.quantisation import Kind, finished, fractions
+from mistyle.io.sandbox.asset_folders import MeshFolders
 from mistyle.io.sandbox.bounds import MAX_PIXELS, MAX_TEXTURE_PIXELS, WORK_TEXTURE, read_bytes, refuse
 from mistyle.io.sandbox.nearby import named_file
 
@@ -136,12 +136,12 @@ def texture_file(path: Path, budget: Budget) -> tuple[Shaped[np.ndarray, "h w 3"
 
 
 def named_texture(
-    where: Path, roots: Sequence[Path], name: str, budget: Budget, notes: list[str]
+    where: Path, folders: MeshFolders, name: str, budget: Budget, notes: list[str]
 ) -> tuple[Shaped[np.ndarray, "h w 3"], bool] | None:
-    """The `texture_file` that the file `where` names, relative to one of `roots` or near them (io/sandbox/nearby.py);
+    """The `texture_file` that the file `where` names, in the mesh's `folders` or near them (io/sandbox/nearby.py);
     None, with a note, without a usable file."""
     try:
-        target, place = named_file(where, roots, name)
+        target, place = named_file(where, folders, name)
         if target is None:
             notes.append(f"Texture {name} is not there and was left out.")
             return None
@@ -179,9 +179,9 @@ def shrunk(data: bytes, where: str, longest: int, quality: int) -> tuple[bytes, 
     return buffer.getvalue(), "image/jpeg"
 
 
-def named_alpha(where: Path, roots: Sequence[Path], name: str) -> Float[np.ndarray, "h w"] | None:
+def named_alpha(where: Path, folders: MeshFolders, name: str) -> Float[np.ndarray, "h w"] | None:
     """The alpha 0..1 of the texture that `named_texture` found; None where it is opaque."""
-    target = named_file(where, roots, name)[0]
+    target = named_file(where, folders, name)[0]
     return None if target is None else alpha_of(read_bytes(target, MAX_PICTURE_BYTES), str(target))
 
 

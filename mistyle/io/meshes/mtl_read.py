@@ -15,6 +15,7 @@ from mistyle.geometry.retexture import REPEAT
 from mistyle.io.images.quantisation import Kind, fractions, linear_rows
 from mistyle.io.images.read import Budget, named_alpha, named_texture
 from mistyle.io.meshes.parsed_mesh import Maps, RawMap, RawMaterial, no_textures
+from mistyle.io.sandbox.asset_folders import MeshFolders, shared_folders
 from mistyle.io.sandbox.bounds import read_bytes
 from mistyle.io.sandbox.nearby import decoded, unmarked
 
@@ -63,13 +64,13 @@ class Statement:
 class MtlEntry:
     """One material of a library: the last value of every statement by its lower-case keyword.
 
-    roots    folders that texture names are relative to: the library's, then the mesh's
+    folders  those of the mesh; texture names are relative to the library's own folder, then to the mesh's
     spelled  the keywords as the file spells them
     """
 
     name: str
     library: Path
-    roots: tuple[Path, ...]
+    folders: MeshFolders
     values: dict[str, str]
     spelled: dict[str, str]
 
@@ -78,16 +79,17 @@ def read_library(library: Path, mesh: Path) -> tuple[dict[str, MtlEntry], tuple[
     """The materials by name, and notes. A file that is not UTF-8 is read as Windows-1252 (or Latin-1)."""
     lines = unmarked(read_bytes(library, MAX_LIBRARY_BYTES)).splitlines()
     texts, plain = decoded(*lines)
-    roots = tuple(dict.fromkeys((real_path(library.parent), real_path(mesh.parent))))
+    anchors = tuple(dict.fromkeys((real_path(library.parent), real_path(mesh.parent))))
+    folders = MeshFolders(mesh, anchors, shared_folders(mesh))
     entries: dict[str, MtlEntry] = {}
-    current = MtlEntry("", library, roots, {}, {})
+    current = MtlEntry("", library, folders, {}, {})
     for line in texts:
         keyword, *rest = line.split(None, 1)[:2] or ("#",)
         if keyword.startswith("#") or not rest:
             continue
         if keyword.lower() == "newmtl":
             name = rest[0].strip()
-            current = entries.setdefault(name, MtlEntry(name, library, roots, {}, {}))
+            current = entries.setdefault(name, MtlEntry(name, library, folders, {}, {}))
         else:
             current.values[keyword.lower()] = rest[0].strip()
             current.spelled[keyword.lower()] = keyword
@@ -231,11 +233,11 @@ def _load(textures: dict[str, Statement], entry: MtlEntry, budget: Budget, tile:
             if stmt.file != textures["normal"].file:
                 notes.append(f"Bump map {file} was left out beside the normal map of material '{entry.name}'.")
             continue
-        pixels = named_texture(entry.library, entry.roots, file, budget, notes)
+        pixels = named_texture(entry.library, entry.folders, file, budget, notes)
         if pixels is None:
             continue
         if name == "opacity":
-            maps[name] = _opacity(stmt, *pixels, named_alpha(entry.library, entry.roots, file), notes)
+            maps[name] = _opacity(stmt, *pixels, named_alpha(entry.library, entry.folders, file), notes)
             continue
         entry_map = _converted("normal" if name == "bump" else name, stmt, *pixels, notes)
         if name == "bump" and not _is_normal_map(pixels[0]):

@@ -13,8 +13,9 @@ from mistyle.io.meshes.mtl_read import MtlEntry, material, read_library, unread
 from mistyle.io.meshes.parsed_mesh import Raw, RawMaterial, no_textures
 from mistyle.io.meshes.polygons import check_positions, parse_numbers, too_many, triangulate
 from mistyle.io.meshes.vertex_colours import coloured, linear_colours
+from mistyle.io.sandbox.asset_folders import mesh_folders
 from mistyle.io.sandbox.bounds import read_bytes, refuse
-from mistyle.io.sandbox.nearby import decoded, mesh_folders, named_file, unmarked
+from mistyle.io.sandbox.nearby import decoded, named_file, unmarked
 
 AGAIN = "Export the mesh again as OBJ with triangles or convex polygons"
 STATED = (b"usemtl", b"o", b"g")  # statements that hold for all faces until the next one

@@ -15,8 +15,9 @@ from mistyle.io.meshes.parsed_mesh import Maps, Raw, RawMap, RawMaterial
 from mistyle.io.meshes.polygons import check_indices, check_positions, parse_numbers, too_many, triangulate
 from mistyle.io.meshes.stl_off_read import AGAIN, CUT_OFF, plain_mesh, small_faces
 from mistyle.io.meshes.vertex_colours import coloured, linear_colours
+from mistyle.io.sandbox.asset_folders import mesh_folders
 from mistyle.io.sandbox.bounds import read_bytes, refuse
-from mistyle.io.sandbox.nearby import decoded, mesh_folders, unmarked
+from mistyle.io.sandbox.nearby import decoded, unmarked
 
 MAX_HEADER = 1 << 20
 MAX_POINTS = 30_000_000

@@ -9,6 +9,7 @@ import numpy as np
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.paths import real_path
+from mistyle.io.sandbox.asset_folders import MeshFolders, mesh_folders, remedy
 from mistyle.process.cores import in_pieces
 
 USD = (".usd", ".usda", ".usdc", ".usdz")
@@ -21,6 +22,7 @@ MAX_NODES = 200_000
 MAX_PIXELS = 1 << 26  # of one picture: 8192 x 8192
 MAX_TEXTURE_PIXELS = 1 << 27  # of all textures of one mesh
 WORK_TEXTURE = 4096  # a mesh's own textures are halved until no side is longer
+COPY = "Copy the file into the mesh's folder and name it relative to the mesh"
 READ_THREADS = 1  # for one large file; the reader process uses more
 
 
@@ -78,11 +80,12 @@ def _unreadable(path: Path, error: OSError) -> InputRefused:
     return refuse(path, f"a file that cannot be read ({error.strerror})", "a readable file", "Check its permissions")
 
 
-def inside(folder: Path, name: str, where: Path, fix: str) -> Path:
+def inside(folder: Path, name: str, where: Path, fix: str, folders: MeshFolders | None = None) -> Path:
     """The file of that name in `folder` or below, which need not exist; links are resolved before the check.
 
     The name is literal (a percent sign is a letter), but backslashes separate folders. Raises InputRefused
-    for network addresses and everything that leads out of the folder; `where` is the file that names it.
+    for network addresses and everything that leads out of the folder; `where` is the file that names it. `folders` are
+    those of the mesh that `where` belongs to: a file in their `shared` ones is accepted, too.
     """
     problem = f"the file name {name[:120]!r}"
     plain = name.replace("\\", "/")
@@ -96,31 +99,36 @@ def inside(folder: Path, name: str, where: Path, fix: str) -> Path:
     except OSError as error:  # a loop of links
         raise refuse(where, problem, "a file name", fix) from error
     drive = re.match(r"[A-Za-z]:/", plain)
-    if drive or not target.is_relative_to(root):
+    shared = () if folders is None else folders.shared
+    if drive or not any(target.is_relative_to(place) for place in (root, *shared)):
         suffix = "" if drive else f", which is {target}"
-        raise refuse(where, f"{problem}{suffix}", f"a file inside the folder {root}", fix)
+        expected = " or ".join(f"a file inside the folder {place}" for place in (root, *shared))
+        fix = fix if folders is None or drive else remedy(folders.mesh, target, fix)
+        raise refuse(where, f"{problem}{suffix}", expected, fix)
     return target
 
 
 def beside(path: Path, reference: str) -> Path:
-    """The file that `path` names, if it lies in the folder of `path` or below; links are resolved before the check.
+    """The file that `path` names, if it lies in one of its folders (sandbox/asset_folders.py) or below; links are
+    resolved before the check.
 
     A `path` that is a link has two folders, its own and that of its target, searched in this order. Percent escapes are
-    decoded as in URIs (not in `inside`). Raises InputRefused for network addresses,
-    absolute paths and everything that leads out of the folder (of both).
+    decoded as in URIs (not in `inside`). Raises InputRefused for network addresses and everything that leads out of
+    the folders.
     """
     name = unquote(reference).replace("\\", "/")
-    fix = "Copy the file into the mesh's folder and name it relative to the mesh"
+    problem = f"a reference to {reference[:120]!r}"
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", name) or name.startswith("//"):
-        raise refuse(path, f"a reference to {reference[:120]!r}", "a relative file name (nothing is fetched)", fix)
+        raise refuse(path, problem, "a relative file name (nothing is fetched)", COPY)
     if "\0" in name or not name:
-        raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix)
+        raise refuse(path, problem, "a file name", COPY)
     try:
-        roots = list(dict.fromkeys((real_path(path.parent), real_path(path).parent)))
-        targets = [real_path(root / name) for root in roots]
+        folders = mesh_folders(path)
+        targets = [real_path(anchor / name) for anchor in folders.anchors]
     except OSError as error:  # a loop of links
-        raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix) from error
-    usable = [t for t in targets if not re.match(r"[A-Za-z]:", name) and any(t.is_relative_to(r) for r in roots)]
+        raise refuse(path, problem, "a file name", COPY) from error
+    drive = re.match(r"[A-Za-z]:", name)
+    usable = [] if drive else [target for target in targets if folders.hold(target)]
     if not usable:
-        raise refuse(path, f"a reference to {reference[:120]!r}", "a file inside the mesh's own folder", fix)
+        raise refuse(path, problem, folders.expected, COPY if drive else remedy(path, targets[-1], COPY))
     return next((target for target in usable if target.exists()), usable[0])

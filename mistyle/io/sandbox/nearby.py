@@ -9,12 +9,12 @@ from pathlib import Path
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.paths import real_path
-from mistyle.io.sandbox.bounds import inside
+from mistyle.io.sandbox.asset_folders import MeshFolders
+from mistyle.io.sandbox.bounds import COPY, inside
 
 TEXTURES = "textures"  # folder in archives of models, in the mesh's folder or beside it
 MARKS = ((b"\xef\xbb\xbf", "utf-8"), (b"\xff\xfe", "utf-16-le"), (b"\xfe\xff", "utf-16-be"))
 MAX_ENTRIES = 20_000  # entries of a folder that are searched
-FIX = "Copy the file into the mesh's folder and name it relative to the mesh"
 
 
 def unmarked(data: bytes) -> bytes:
@@ -36,33 +36,26 @@ def decoded(*texts: bytes) -> tuple[list[str], bool]:
     return [text.decode("latin-1") for text in texts], False
 
 
-def mesh_folders(path: Path) -> tuple[Path, ...]:
-    """Folders of a mesh file's relative names: its own, then that of a link's target."""
-    return tuple(dict.fromkeys((real_path(path.parent), real_path(path).parent)))
-
-
-def named_file(
-    where: Path, roots: Sequence[Path], name: str, *, picture: bool = True
-) -> tuple[Path | None, str | None]:
+def named_file(where: Path, folders: MeshFolders, name: str, *, picture: bool = True) -> tuple[Path | None, str | None]:
     """The file that `where` names, and its actual place if that differs from the name.
 
-    The literal name is tried first, relative to each folder of `roots`. Then its last parts are searched there,
-    ignoring case. For a `picture`, its last part is also searched in the folder `textures` of a root or beside it: the
-    only folder outside the roots that is ever opened. None without such a file. Raises InputRefused where there is none
-    and the name leads out of the roots.
+    The literal name is tried first, relative to each anchor of the mesh's `folders`. Then its last parts are searched
+    there, and the whole name in the shared folders, ignoring case. For a `picture`, its last part is also searched in
+    the folder `textures` of an anchor or beside it: the only folder outside that is ever opened. None without such a
+    file. Raises InputRefused where there is none and the name leads out of the folders.
     """
     name = name.strip().strip('"')
     refused: InputRefused | None = None
-    for root in roots:
+    for root in folders.anchors:
         try:
-            target = inside(root, name, where, FIX)
+            target = inside(root, name, where, COPY, folders)
         except InputRefused as error:
             refused = error
             continue
         if target.is_file():
             return target, None
-    for root in roots:
-        match = _search(real_path(root), name, picture)
+    for root in folders.anchors:
+        match = _search(real_path(root), name, picture) or _shared(folders.shared, root, name)
         if match is not None:
             return match, os.path.relpath(match, real_path(where.parent)).replace("\\", "/")
     if refused is not None:
@@ -81,6 +74,18 @@ def _search(root: Path, name: str, picture: bool) -> Path | None:
     for folder, tail in places:
         # Links to files outside are not followed.
         target = _walk(folder, tail)
+        if target is not None and real_path(target).is_relative_to(folder) and target.is_file():
+            return real_path(target)
+    return None
+
+
+def _shared(shared: Sequence[Path], anchor: Path, name: str) -> Path | None:
+    """The file of that name, ignoring case, in a shared folder; `..` leads to the folder above."""
+    if "\0" in name:
+        return None
+    whole = Path(os.path.normpath(anchor / name.replace("\\", "/")))
+    for folder in shared:
+        target = _walk(folder, whole.relative_to(folder).parts) if whole.is_relative_to(folder) else None
         if target is not None and real_path(target).is_relative_to(folder) and target.is_file():
             return real_path(target)
     return None

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.errors import MistyleError
-from mistyle.io.sandbox import bounds, rpc_codec, shared_copy
+from mistyle.io.sandbox import asset_folders, bounds, rpc_codec, shared_copy
 from mistyle.process.cores import cores
 from mistyle.process.memory import trim
 
@@ -83,6 +83,7 @@ def _answer(task: Any, arguments: tuple[Any, ...], request: dict[str, Any]) -> t
         for module, values in request["limits"].items():
             for name, limit in values.items():
                 setattr(import_module(f"mistyle.io.{module}"), name, limit)
+        asset_folders.requested = request["assets"]
         os.chdir(request["cwd"])
         return task(*arguments), {}, False
     except MistyleError as error:

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from mistyle.core import errors
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.core.paths import PACKAGE
 from mistyle.io.sandbox import rpc_codec, shared_copy
+from mistyle.io.sandbox.asset_folders import ASSETS
 from mistyle.io.sandbox.bounds import MAX_FILE_BYTES, refuse
 
 MEMORY = 2 << 30
@@ -124,7 +126,7 @@ class Reader:
         timer.start()
         try:
             request = {"task": task, "cwd": os.getcwd(), "limits": _bounds(), "memory": memory, "seconds": seconds}
-            request["may_lend"] = self.lends
+            request |= {"may_lend": self.lends, "assets": os.environ.get(ASSETS, "")}
             rpc_codec.send(self.input.write, (path, *arguments), **request)  # type: ignore[arg-type]
             value, head = rpc_codec.receive(self.output.readinto, self._copy)  # type: ignore[attr-defined]
             if self.borrowed:
@@ -179,23 +181,34 @@ class Reader:
             self.process.wait()
 
 
-def ask(task: str, path: Path, *arguments: Any) -> Any:
+def ask(task: str, path: Path, *arguments: Any, more: Callable[[], Sequence[Path]] = tuple) -> Any:
     """The result of `task` (io/sandbox/reader_tasks.py) for the file at `path`, decoded in the child.
 
     Raises the task's own errors (InputRefused and related, with their messages). InputRefused where the child crashed,
-    hung or ran out of memory over the file; EnvironmentMissing where no child can be started.
+    hung or ran out of memory over the file; EnvironmentMissing where no child can be started. `more` lists the files
+    that it names: if memory runs out, one more try has the limits for them all.
     """
     size = _size(path)
+    for last in (False, True):
+        try:
+            return _limited(task, path, arguments, size)
+        except OutOfMemory:
+            largest = size if last else min(size + sum(map(_size, more())), MAX_FILE_BYTES)
+        if largest == size:
+            break
+        size = largest
+    memory = MEMORY + MEMORY_PER_BYTE * size
+    raise refuse(path, f"a file whose decoding takes more than {memory / 2**30:.1f} GiB", WHOLE, AGAIN)
+
+
+def _limited(task: str, path: Path, arguments: tuple[Any, ...], size: int) -> Any:
+    """The task's result with the limits of `size` bytes. Raises OutOfMemory."""
     with _lock:
         # A child that has served before may have fragmented memory: the request is repeated in a new one.
-        for fresh in (_running().served == 0, True):
-            try:
+        if _running().served:
+            with suppress(OutOfMemory):
                 return _running().ask(path, task, arguments, size)
-            except OutOfMemory:
-                if fresh:
-                    break
-        memory = MEMORY + MEMORY_PER_BYTE * size
-        raise refuse(path, f"a file whose decoding takes more than {memory / 2**30:.1f} GiB", WHOLE, AGAIN)
+        return _running().ask(path, task, arguments, size)
 
 
 def start() -> None:

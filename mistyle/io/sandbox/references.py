@@ -9,8 +9,9 @@ from mistyle.io.gltf.check import parse_json
 from mistyle.io.meshes.mtl_read import NAMING, read_library, statement, tile_name
 from mistyle.io.meshes.obj_read import library_files
 from mistyle.io.meshes.ply_read import MAX_HEADER, texture_files
+from mistyle.io.sandbox.asset_folders import mesh_folders
 from mistyle.io.sandbox.bounds import MAX_JSON_BYTES, beside, read_bytes
-from mistyle.io.sandbox.nearby import mesh_folders, named_file, unmarked
+from mistyle.io.sandbox.nearby import named_file, unmarked
 
 
 def references(path: Path) -> list[Path]:
@@ -40,7 +41,7 @@ def _of_library(library: Path, path: Path) -> list[Path]:
             file = statement(entry.values[key]).file
             first = tile_name(file, 1001)
             with suppress(InputRefused):
-                target = named_file(library, entry.roots, first or file)[0]
+                target = named_file(library, entry.folders, first or file)[0]
                 if target is not None:
                     files += [target] if first is None else target.parent.glob(target.name.replace("1001", "1???"))
     return files

@@ -1,4 +1,4 @@
-"""Dependencies of a USD file, checked before composition: every layer and package in the file's own folder."""
+"""Dependencies of a USD file, checked before composition: every layer and package in the folders that it may name."""
 
 import posixpath
 import re
@@ -10,11 +10,14 @@ from typing import Any
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.paths import real_path
+from mistyle.io.sandbox.asset_folders import MeshFolders, mesh_folders, remedy
 from mistyle.io.sandbox.bounds import MAX_FILE_BYTES, USD, refuse
 
 MAX_LAYERS = 2_000
 MAX_ENTRIES = 20_000
-COPY = "Copy it into the mesh's folder, or flatten the stage (usdcat --flatten)"
+MATERIALX = ".mtlx"
+HERE, FLATTEN = "Copy it into the mesh's folder", "flatten the stage (usdcat --flatten)"
+COPY = f"{HERE}, or {FLATTEN}"
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,17 @@ class PackagedFile:
 
     def __str__(self) -> str:
         return f"{self.file}[{self.inner}]" if self.inner else str(self.file)
+
+
+@dataclass(frozen=True)
+class CheckedLayers:
+    """The files of a stage's layers and packages, the folders that they may name, and the references to MaterialX
+    documents: (layer, name in it, document). `notes` tell which documents may not be opened."""
+
+    files: list[Path]
+    folders: MeshFolders
+    documents: list[tuple[PackagedFile, str, PackagedFile | None]]
+    notes: list[str]
 
 
 def place_of(layer: Any) -> PackagedFile:
@@ -42,8 +56,8 @@ def _inside(place: PackagedFile) -> PackagedFile:
         return PackagedFile(place.file, package.namelist()[0])
 
 
-def locate(root: Path, anchor: PackagedFile, reference: str) -> PackagedFile:
-    """The file that a layer at `anchor` names. Raises InputRefused where it is outside `root` or not a plain file
+def locate(folders: MeshFolders, anchor: PackagedFile, reference: str) -> PackagedFile:
+    """The file that a layer at `anchor` names. Raises InputRefused where it is outside `folders` or not a plain file
     name."""
     problem = f"a reference to {reference[:120]!r}"
     name = reference.replace("\\", "/")
@@ -60,21 +74,27 @@ def locate(root: Path, anchor: PackagedFile, reference: str) -> PackagedFile:
         target = real_path(anchor.file.parent / outer)
     except OSError as error:  # a loop of links
         raise refuse(anchor.file, problem, "a file name", COPY) from error
-    if not target.is_relative_to(root):
-        raise refuse(anchor.file, problem, "a file inside the mesh's own folder", COPY)
+    if not folders.hold(target):
+        raise refuse(anchor.file, problem, folders.expected, remedy(folders.mesh, target, HERE, [FLATTEN]))
     return PackagedFile(target, inner if bracket else "")
 
 
-def check_layers(pxr: Any, path: Path) -> list[Path]:
+def usd_folders(path: Path) -> MeshFolders:
+    """The folders that a stage may name: USD resolves a link to a file before it reads names from it."""
+    return mesh_folders(real_path(path))
+
+
+def check_layers(pxr: Any, path: Path) -> CheckedLayers:
     """Open the file and all layers that it is composed of, one by one, each only after its name and size passed.
 
-    Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, and
-    compressed or nested packages. Also refused: value clips (USD would open them later), and too many or too large
-    files.
+    Refused: names that lead out of the folders or to a network, layers of other formats, and compressed or nested
+    packages. Also refused: value clips (USD would open them later), and too many or too large files. MaterialX
+    documents are located and not opened.
     """
-    root, start = real_path(path).parent, PackagedFile(real_path(path))
+    start = PackagedFile(real_path(path))
     pending, seen = [start], {str(start)}
     files: dict[Path, int] = {}
+    checked = CheckedLayers([], usd_folders(path), [], [])
     while pending:
         layer = pending.pop()
         if layer.file not in files:
@@ -83,7 +103,10 @@ def check_layers(pxr: Any, path: Path) -> list[Path]:
             total = f"{len(seen)} layers of {sum(files.values()) / 2**20:.0f} MiB"
             raise refuse(path, total, f"at most {MAX_LAYERS} and {MAX_FILE_BYTES >> 20} MiB", "Flatten the stage")
         for reference in _named(pxr, layer, path):
-            dependency = locate(root, _inside(layer), reference)
+            if reference.lower().rstrip("]").endswith(MATERIALX):
+                checked.documents.append((layer, reference, _document(checked, _inside(layer), reference)))
+                continue
+            dependency = locate(checked.folders, _inside(layer), reference)
             if Path(dependency.inner or dependency.file).suffix.lower() not in USD:
                 raise refuse(path, f"a layer {reference[:120]!r}", f"layers of kind {' '.join(USD)}", COPY)
             if dependency.inner and dependency.inner.lower().endswith(".usdz"):
@@ -91,7 +114,17 @@ def check_layers(pxr: Any, path: Path) -> list[Path]:
             if str(dependency) not in seen:
                 seen.add(str(dependency))
                 pending.append(dependency)
-    return list(files)
+    checked.files.extend(files)
+    return checked
+
+
+def _document(checked: CheckedLayers, layer: PackagedFile, reference: str) -> PackagedFile | None:
+    """The MaterialX document that a layer names; None, with a note, where it may not be opened."""
+    try:
+        return locate(checked.folders, layer, reference)
+    except InputRefused as error:
+        checked.notes.append(f"MaterialX document {reference} was left out with its materials: {error}")
+        return None
 
 
 def _named(pxr: Any, place: PackagedFile, path: Path) -> Iterator[str]:
@@ -108,7 +141,8 @@ def _named(pxr: Any, place: PackagedFile, path: Path) -> Iterator[str]:
     layer.Traverse("/", lambda p: clips.append(p) if _has_clips(layer, p) else None)
     if clips:
         raise refuse(path, f"value clips at {clips[0]}", "values in the layers themselves", "Export a single frame")
-    yield from (name for name in layer.GetCompositionAssetDependencies() if name)
+    names = layer.GetCompositionAssetDependencies()
+    yield from (name for name in names if name and not pxr.Sdf.Layer.IsAnonymousLayerIdentifier(name))
 
 
 def _has_clips(layer: Any, path: Any) -> bool:
@@ -149,20 +183,24 @@ def _check_package(path: Path, size: int) -> None:
         raise refuse(path, "files that lie on top of each other in the package", "each in its own place", again)
 
 
-def textures_named(pxr: Any, files: list[Path], root: Path) -> list[Path]:
-    """The other files in `root` that layers name, with UDIM tiles expanded: mostly textures."""
+def textures_named(pxr: Any, checked: CheckedLayers) -> list[Path]:
+    """The other files in its folders that layers name, with UDIM tiles expanded: mostly textures."""
     result: set[Path] = set()
-    for file in files:
+    for file in checked.files:
         if file.suffix.lower() == ".usdz":
             continue
         for name in {n for kind in pxr.UsdUtils.ExtractExternalReferences(str(file)) for n in kind}:
             try:
-                target = locate(root, PackagedFile(file), name).file
+                result.update(tiles_of(locate(checked.folders, PackagedFile(file), name).file))
             except InputRefused:
                 continue
-            tiles = target.parent.glob(target.name.replace("<UDIM>", "1???")) if "<UDIM>" in target.name else [target]
-            result |= {tile for tile in tiles if tile.is_file()}
-    return sorted(result - set(files))
+    return sorted(result - set(checked.files))
+
+
+def tiles_of(target: Path) -> list[Path]:
+    """A texture's existing files: one, or the tiles of a name with <UDIM>."""
+    tiles = target.parent.glob(target.name.replace("<UDIM>", "1???")) if "<UDIM>" in target.name else [target]
+    return [tile for tile in tiles if tile.is_file()]
 
 
 def usd_message(error: Exception) -> str:

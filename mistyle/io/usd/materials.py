@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,9 @@ from mistyle.core.errors import InputRefused
 from mistyle.geometry.retexture import Wrap
 from mistyle.io.images.read import MAX_PICTURE_BYTES, Budget, alpha_map, decode
 from mistyle.io.meshes.parsed_mesh import Maps, RawMap, RawMaterial, no_textures
+from mistyle.io.sandbox.asset_folders import MeshFolders
 from mistyle.io.usd.layers import PackagedFile, bytes_of, locate, place_of
+from mistyle.io.usd.mtlx import UNREAD as UNREAD_NOTES
 
 CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
 INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}
@@ -105,9 +106,12 @@ def outside(usd_material: UsdMaterial, uvs: Float[np.ndarray, "n 3 2"] | None) -
     return notes
 
 
-def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any, notes: list[str]) -> UsdMaterial:
+def read_material(
+    pxr: Any, material: Any, folders: MeshFolders, budget: Budget, time: Any, notes: list[str]
+) -> UsdMaterial:
     """The preview surface of a UsdShade.Material; a plain material, and a note, where it has none."""
     name = material.GetPrim().GetName()
+    notes += [str(note) for note in material.GetPrim().GetCustomDataByKey(UNREAD_NOTES) or ()]
     surface = material.ComputeSurfaceSource()[0]
     if not surface or surface.GetShaderId() != "UsdPreviewSurface":
         notes.append(f"Material '{name}' has no UsdPreviewSurface and was read as plain.")
@@ -145,7 +149,7 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
     tiled = any("<UDIM>" in t.file for t in textures.values())
     raw = RawMaterial(
         name,
-        partial(_load, textures, root, budget) if textures else no_textures,
+        partial(_load, textures, folders, budget) if textures else no_textures,
         tiled if textures else None,
         (albedo[0], albedo[1], albedo[2]),
         1.0 if "roughness" in textures else float(np.clip(constants["roughness"], 0, 1)),
@@ -265,13 +269,15 @@ def _lookup(pxr: Any, shader_input: Any, time: Any) -> tuple[str, Float[np.ndarr
     return "st", transform
 
 
-def _load(textures: dict[str, UsdTexture], root: Path, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
+def _load(
+    textures: dict[str, UsdTexture], folders: MeshFolders, budget: Budget, tile: int
+) -> tuple[Maps, tuple[str, ...]]:
     maps: dict[str, RawMap] = {}
     notes: list[str] = []
     for kind, texture in textures.items():
         name = texture.file.replace("<UDIM>", str(tile))
         try:
-            values = _texels(kind, texture, locate(root, texture.anchor, name), budget, notes)
+            values = _texels(kind, texture, locate(folders, texture.anchor, name), budget, notes)
         except InputRefused as error:
             notes.append(f"Texture {name} was left out: {error}")
             continue

@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive, Shading
-from mistyle.core.paths import real_path
 from mistyle.io.images.read import Budget
 from mistyle.io.meshes.parsed_mesh import Raw
 from mistyle.io.meshes.polygons import too_many
 from mistyle.io.sandbox.bounds import refuse
-from mistyle.io.usd.layers import check_layers, textures_named
+from mistyle.io.usd.layers import check_layers, textures_named, tiles_of, usd_folders
 from mistyle.io.usd.materials import UsdMaterial, at_own_coordinates, outside, plain, read_material
 from mistyle.io.usd.mesh import CornerValues, Polygons, corner_normals, is_cage, polygons, table_of, triples
+from mistyle.io.usd.mtlx import preview_layer
 from mistyle.io.usd.shapes import is_shape
 from mistyle.io.usd.stage import mesh_prims, open_stage, pose, user_matrix
 from mistyle.io.usd.write import library
@@ -48,7 +48,7 @@ class _Reading:
         self.notes: list[str] = []
         self.materials: list[UsdMaterial] = []
         self._numbers: dict[str, int] = {}
-        self._budget = Budget(path)
+        self._budget, self._folders = Budget(path), usd_folders(path)
 
     def number(self, material: Any, shown: UsdMaterial) -> int:
         """The index in `materials` of a bound material; that of `shown` where none is bound."""
@@ -56,23 +56,28 @@ class _Reading:
         key = str(material.GetPath()) if material else f"{display.albedo_factor} {shown.colour} {display.shading}"
         if key not in self._numbers:
             self._numbers[key] = len(self.materials)
-            root = real_path(self.path).parent
-            entry = read_material(self.pxr, material, root, self._budget, self.time, self.notes) if material else shown
-            self.materials.append(entry)
+            arguments = (self._folders, self._budget, self.time, self.notes)
+            self.materials.append(read_material(self.pxr, material, *arguments) if material else shown)
         return self._numbers[key]
 
 
 def files_of(path: Path) -> list[Path]:
     """The layers, packages and textures that a file depends on, including itself."""
     pxr = library()
-    files = check_layers(pxr, path)
-    return [*files, *textures_named(pxr, files, real_path(path).parent)]
+    checked = check_layers(pxr, path)
+    files = [*checked.files, *textures_named(pxr, checked)]
+    documents = {str(document): document for _, _, document in checked.documents if document is not None}
+    for document in documents.values():
+        textures = [Path(name) for name in preview_layer(pxr, document, checked.folders, [])[1]]
+        files += [tile for texture in textures for tile in tiles_of(texture)]
+    return list(dict.fromkeys(files))
 
 
 def read_usd(path: Path, max_faces: int) -> Raw:
     """Triangles of all visible meshes of purpose default or render, in stage order, one material per bound material."""
     pxr = library()
-    stage, reading = open_stage(pxr, path), _Reading(pxr, path, max_faces)
+    reading = _Reading(pxr, path, max_faces)
+    stage = open_stage(pxr, path, reading.notes)
     pose(pxr, stage)
     user, pieces, faces = user_matrix(pxr, stage, reading.notes), [], 0
     for prim, owner, matrix in mesh_prims(pxr, stage, path, reading.notes):

@@ -15,16 +15,24 @@ from mistyle.core.asset import TURNED
 from mistyle.core.paths import real_path
 from mistyle.geometry.similarity import Y_FROM_Z
 from mistyle.io.sandbox.bounds import MAX_NODES, refuse
-from mistyle.io.usd.layers import check_layers, usd_message
+from mistyle.io.usd.layers import COPY, CheckedLayers, check_layers, place_of, usd_message
+from mistyle.io.usd.mtlx import preview_layer
 from mistyle.io.usd.shapes import is_shape
 
 
-def open_stage(pxr: Any, path: Path) -> Any:
-    """The composed stage of a file whose layers have passed. Raises InputRefused for every composition error."""
-    check_layers(pxr, path)
+def open_stage(pxr: Any, path: Path, notes: list[str] | None = None) -> Any:
+    """The composed stage of a file whose layers have passed. Raises InputRefused for every composition error.
+
+    References to MaterialX documents become preview materials in memory (mtlx.py); the files stay unchanged.
+    """
+    checked = check_layers(pxr, path)
     try:
+        layers = _with_previews(pxr, checked, [] if notes is None else notes)  # edited in memory: kept until it is open
         stage = pxr.Usd.Stage.Open(str(real_path(path)))
-        errors = stage.GetCompositionErrors()
+        # A document's layer holds its materials only; what else it is referenced for is absent.
+        absent = [f"prim path @{layer.identifier}@" for layer in layers.values() if layer and layer.anonymous]
+        errors = [e for e in stage.GetCompositionErrors() if not any(words in str(e) for words in absent)]
+        used = [place_of(layer).file for layer in stage.GetUsedLayers() if not layer.anonymous]
     except pxr.Tf.ErrorException as error:
         raise refuse(
             path, f"a stage that USD cannot open ({usd_message(error)})", "a USD file", "Export it again"
@@ -32,7 +40,25 @@ def open_stage(pxr: Any, path: Path) -> Any:
     if errors:
         problem = f"a stage that does not compose ({str(errors[0]).strip().splitlines()[0][:160]})"
         raise refuse(path, problem, "references without cycles to existing prims", "Flatten or repair the stage")
+    unknown = [file for file in used if file not in checked.files]
+    if unknown:  # USD resolves `..` in a layer behind a link from the link's folder
+        raise refuse(path, f"a link to a layer that names {unknown[0]}", checked.folders.expected, COPY)
     return stage
+
+
+def _with_previews(pxr: Any, checked: CheckedLayers, notes: list[str]) -> dict[str, Any]:
+    """Replace the references to MaterialX documents, in memory, by layers with their materials; returns these layers
+    and the edited ones."""
+    layers: dict[str, Any] = {}
+    notes += checked.notes
+    for place, name, document in checked.documents:
+        key = str(document)
+        if document is not None and key not in layers:
+            layers[key] = preview_layer(pxr, document, checked.folders, notes)[0]
+        preview, edited = layers.get(key), pxr.Sdf.Layer.FindOrOpen(str(place))
+        layers[f"edited {place}"] = edited
+        edited.UpdateCompositionAssetDependency(name, preview.identifier if preview else "")
+    return layers
 
 
 def pose(pxr: Any, stage: Any) -> None:

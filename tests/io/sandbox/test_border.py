@@ -45,7 +45,14 @@ CALLS = {
     *(("torch", "load"), ("pickle", "load"), ("pickle", "loads"), ("yaml", "safe_load"), ("library", "safe_load")),
     *(("yaml", "load"), ("tomllib", "load"), ("tomllib", "loads"), ("mi", "load_file"), ("np", "memmap")),
     *(("ElementTree", "parse"), ("ElementTree", "fromstring"), ("zipfile", "ZipFile"), ("np", "loadtxt")),
-    *(("trimesh", "load"), ("imageio", "imread"), ("Stage", "Open"), ("json", "load"), ("xatlas", "parse_mesh")),
+    *(
+        ("trimesh", "load"),
+        ("imageio", "imread"),
+        ("Stage", "Open"),
+        ("json", "load"),
+        ("xatlas", "parse_mesh"),
+        ("mx", "readFromXmlString"),
+    ),
 }
 DECODERS = {
     *(
@@ -61,7 +68,7 @@ DECODERS = {
     *("io/gltf/check", "io/gltf/materials", "io/cameras/colmap", "io/cameras/metashape", "io/cameras/realityscan"),
     *("io/sandbox/references", "io/sandbox/reader_tasks"),
     *("io/usd/read", "io/usd/layers", "io/usd/materials", "io/meshes/mtl_read", "io/meshes/ply_read"),
-    *("io/gltf/pose", "io/usd/stage", "io/usd/mesh"),
+    *("io/gltf/pose", "io/usd/stage", "io/usd/mesh", "io/usd/mtlx"),
 }
 ALLOWED = {
     "setup/environment": "pyproject.toml of the clone",
@@ -282,6 +289,25 @@ def test_a_file_that_takes_too_much_memory_is_refused(tmp_path: Path):
     line = [sys.executable, "-c", LITTLE, str(tmp_path / "a.png")]
     done = subprocess.run(line, cwd=Path(__file__).parents[3], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_files_that_a_mesh_names_count_once_memory_runs_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name, size in (("a.usda", 10), ("b.usdc", 1_000)):
+        (tmp_path / name).write_bytes(b"x" * size)
+    sizes: list[int] = []
+
+    def limited(task: str, path: Path, arguments: tuple, size: int) -> str:
+        sizes.append(size)
+        if size < 1_010:
+            raise reader_process.OutOfMemory
+        return "read"
+
+    monkeypatch.setattr(reader_process, "_limited", limited)
+    assert reader_process.ask("mesh", tmp_path / "a.usda", more=lambda: [tmp_path / "b.usdc"]) == "read"
+    assert sizes == [10, 1_010]
+    for others in ([], [tmp_path / "a.usda"]):
+        with pytest.raises(InputRefused, match="a file whose decoding takes more than"):
+            reader_process.ask("mesh", tmp_path / "a.usda", more=lambda others=others: others)
 
 
 def test_threads_share_the_child(tmp_path: Path):
