@@ -207,7 +207,7 @@ def _pictures() -> list[Seed]:
     result += [Seed(f"exr {name}", "exr", {"a.exr": data}, "a.exr") for name, data in _exrs().items()]
     import cv2
 
-    done, hdr = cv2.imencode(".hdr", rng.random((16, 24, 3)).astype(np.float32) * 9)
+    done, hdr = cv2.imencode(".hdr", rng.random((16, 32, 3)).astype(np.float32) * 9)
     assert done
     return [*result, Seed("hdr", "hdr", {"a.hdr": hdr.tobytes()}, "a.hdr")]
 
@@ -216,7 +216,7 @@ def _exrs() -> dict[str, bytes]:
     import OpenEXR
 
     rng = np.random.default_rng(2)
-    planes = {c: rng.random((20, 24)).astype(np.float32) for c in ("R", "G", "B", "A", "depth.Z")}
+    planes = {c: rng.random((20, 40)).astype(np.float32) for c in ("R", "G", "B", "A", "depth.Z")}
     halves = {c: p.astype(np.float16) for c, p in planes.items()}
     found = {}
     for name, compression, channels in (
