@@ -10,6 +10,7 @@ import datetime
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,7 +139,7 @@ def write_turns(
 
     turns = {
         "turntable": (settings.turntable, stage.turn, lights[0]),
-        "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
+        "light_turn": (settings.hdri_turn, partial(stage.turn, of_light=True), lights[2]),
     }
     films = {}
     for name, (frames, draw, rig) in turns.items():
