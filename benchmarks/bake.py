@@ -8,10 +8,11 @@ padded albedo. Baking reads neither normal, uv nor part of a view: the views her
 import numpy as np
 
 from benchmarks.common import arguments, finish, peak_gb, timed
-from mistyle.atlas.bake import bake
+from mistyle.atlas.bake import Backprojection, backproject, fill_in_place
 from mistyle.atlas.settings import BakeSettings
-from mistyle.atlas.texels import rasterise
+from mistyle.atlas.texels import pad_in_place, rasterise
 from mistyle.core.camera import Camera, pixel_centres, rig
+from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.settings import RigSettings
 from mistyle.core.view import View
@@ -68,13 +69,21 @@ def draw(camera: Camera) -> View:
     return View(camera, rgb, depth.astype(np.float32), nothing, nothing[..., :2], part, mask, mask.astype(np.float32))
 
 
+def bake(views: list[View], texels: Texels, mesh: Mesh) -> Backprojection:
+    """All of section 4.1.4 after the rasterisation, in one array."""
+    baked = backproject(views, texels, BakeSettings(), mesh=mesh)
+    fill_in_place(baked.albedo, baked.known, texels)
+    pad_in_place([baked.albedo], texels, 16)
+    return baked
+
+
 def measure(figures: dict[str, float], size: int, resolution: int, cells: int) -> None:
     """Rasterise and bake once; what it needed is gone when it returns."""
     views = [draw(camera) for camera in rig(RigSettings(resolution=resolution))]
     mesh = spheres(cells)
     figures["bake.faces"] = len(mesh.faces)
     texels = timed(figures, "bake.rasterise_seconds", lambda: rasterise(mesh, 0, size))
-    baked = timed(figures, "bake.seconds", lambda: bake(views, texels, BakeSettings(), 16, mesh=mesh))
+    baked = timed(figures, "bake.seconds", lambda: bake(views, texels, mesh))
     figures["bake.peak_gb"] = peak_gb()
     figures["bake.covered_share"] = float(texels.covered.mean())
     figures["bake.known_share"] = float(baked.known[texels.covered].mean())

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.atlas.gaps import fill_in_place
 from mistyle.atlas.settings import BakeSettings
-from mistyle.atlas.texels import pad_in_place, threaded
+from mistyle.atlas.texels import threaded
 from mistyle.core.camera import Camera
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
@@ -105,27 +105,6 @@ def accepted(
 
     threaded(work, -(-covered.size // ROWS), progress)
     return chosen, seen
-
-
-def bake(
-    views: Sequence[View],
-    texels: Texels,
-    settings: BakeSettings,
-    padding: int = 16,
-    progress: Callable[[float], None] = lambda done: None,
-    *,
-    mesh: Mesh | None = None,
-) -> Backprojection:
-    """`backproject`, `fill` and `texels.pad` in one array: all of section 4.1.4 after the rasterisation.
-
-    albedo is complete inside the islands and `padding` texels around them; known, view and seen are those of
-    `backproject`.
-    """
-    baked = backproject(views, texels, settings, lambda done: progress(0.9 * done), mesh=mesh)
-    fill_in_place(baked.albedo, baked.known, texels)
-    pad_in_place([baked.albedo], texels, padding)
-    progress(1.0)
-    return baked
 
 
 def _faces_towards(mesh: Mesh, cameras: Sequence[Camera]) -> Bool[np.ndarray, "c f"]:

@@ -47,12 +47,15 @@ class BatchJob(FrozenModel):
     mesh: Path
     style: Path | None = None
     references: Path | None = None
-    lights: str | None = Field(default=None, description="lights of a fit: a lights.json, or 'unknown'")
+    lights: str | None = None
+    """lights of a fit: a lights.json, or 'unknown'"""
     masks: Path | None = None
     exposure: Path | None = None
-    name: str | None = Field(default=None, description="name of the asset and of the job's folder")
+    name: str | None = None
+    """name of the asset and of the job's folder"""
     preset: str | None = None
-    settings: dict[str, Any] = Field(default={}, description="nested, or with dotted names as for --set")
+    settings: dict[str, Any] = {}
+    """nested, or with dotted names as for --set"""
 
 
 class Grid(FrozenModel):

@@ -67,21 +67,17 @@ Program = Literal["blender", "unreal", "unity-urp", "unity-hdrp", "houdini", "ar
 class DeliverSettings(FrozenModel):
     """The files for other programs in OUT/delivered/<target>; none while all fields keep their defaults."""
 
-    formats: Annotated[tuple[Format, ...], BeforeValidator(listed)] = Field(
-        default=(), description="glb, usd, mtlx, obj, maps (maps and glb where only a target is named)"
-    )
-    target: Annotated[tuple[Program, ...], BeforeValidator(listed)] = Field(
-        default=(), description="the programs that textures are packed for (blender where only formats are named)"
-    )
-    name: Annotated[str, BeforeValidator(checked_name)] = Field(
-        default="{asset}",
-        description="pattern of the delivered name: {asset} {mesh} {style} {target}; {v:03} counts up, so that no "
-        "earlier delivery is overwritten",
-    )
-    textures: Annotated[str, BeforeValidator(checked_textures)] = Field(
-        default=TEXTURES, description="pattern of texture files: {asset} {map} {udim} {ext}"
-    )
-    metres_per_unit: float = Field(default=1.0, gt=0, description="metresPerUnit of USD")
+    formats: Annotated[tuple[Format, ...], BeforeValidator(listed)] = ()
+    """glb, usd, mtlx, obj, maps (maps and glb where only a target is named)"""
+    target: Annotated[tuple[Program, ...], BeforeValidator(listed)] = ()
+    """the programs that textures are packed for (blender where only formats are named)"""
+    name: Annotated[str, BeforeValidator(checked_name)] = "{asset}"
+    """pattern of the delivered name: {asset} {mesh} {style} {target}; {v:03} counts up, so that no earlier delivery is
+    overwritten"""
+    textures: Annotated[str, BeforeValidator(checked_textures)] = TEXTURES
+    """pattern of texture files: {asset} {map} {udim} {ext}"""
+    metres_per_unit: float = Field(default=1.0, gt=0)
+    """metresPerUnit of USD"""
 
     @property
     def wanted(self) -> bool:
@@ -100,13 +96,9 @@ class DeliverSettings(FrozenModel):
 class ColourSettings(FrozenModel):
     """Colour spaces of inputs and outputs, by their OpenColorIO names; all computation is in linear Rec.709."""
 
-    space: str | None = Field(
-        default=None,
-        description="scene-linear space of EXR and HDR pictures in and of delivered EXR textures (linear Rec.709)",
-    )
-    pictures: str | None = Field(
-        default=None, description="space of PNG, JPEG, TIFF pictures in (their profile, else sRGB)"
-    )
-    config: str | None = Field(
-        default=None, description="the OpenColorIO config ($OCIO, else the one inside opencolorio)"
-    )
+    space: str | None = None
+    """scene-linear space of EXR and HDR pictures in and of delivered EXR textures (linear Rec.709)"""
+    pictures: str | None = None
+    """space of PNG, JPEG, TIFF pictures in (their profile, else sRGB)"""
+    config: str | None = None
+    """the OpenColorIO config ($OCIO, else the one inside opencolorio)"""

@@ -167,18 +167,15 @@ def _kernels(device: torch.device, dtype: torch.dtype) -> torch.Tensor:
     at = torch.arange(-3, 4, dtype=torch.float64)
     y, x = torch.meshgrid(at, at, indexing="ij")
     gauss = torch.exp(-(x**2 + y**2) / 2) / (2 * math.pi)
-    kernels = []
+    slopes, curvatures = [], []
     for k in range(ORIENTATIONS):
         angle = math.pi * k / ORIENTATIONS
         along = math.cos(angle) * x + math.sin(angle) * y
         # Correlation with along·G measures the slope; with (1 - along²)·G the curvature, bright ridges positive.
-        kernels.append(ODD_SCALE * along * gauss)
-    for k in range(ORIENTATIONS):
-        angle = math.pi * k / ORIENTATIONS
-        along = math.cos(angle) * x + math.sin(angle) * y
+        slopes.append(ODD_SCALE * along * gauss)
         even = (1 - along**2) * gauss
-        kernels.append(EVEN_SCALE * (even - gauss * even.sum() / gauss.sum()))
-    return torch.stack(kernels)[:, None].to(device, dtype)
+        curvatures.append(EVEN_SCALE * (even - gauss * even.sum() / gauss.sum()))
+    return torch.stack(slopes + curvatures)[:, None].to(device, dtype)
 
 
 def _chroma_gradients(planes: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:

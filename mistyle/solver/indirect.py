@@ -51,31 +51,17 @@ class Indirect:
         self.sharp = [(shape, mi.load_dict(sharp[name])) for name, shape in shapes.items()]
 
     def pictures(
-        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
-    ) -> list[Float[np.ndarray, "h w 3"]]:
-        """Indirect radiance, linear Rec.709, in pictures of at most MOST pixels a side, under each of `many`
-        lights.
+        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, *, vectors: bool = False
+    ) -> list[tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 9"] | None]]:
+        """Indirect radiance, linear Rec.709, in pictures of at most MOST pixels a side, under each of `many` lights.
+        With `vectors` also the vector irradiance E of indirect light at the first surface point: (9,) per pixel, world
+        x, y, z of red, then of green and blue; else None.
 
-        Pixels beside the object have the value of the nearest pixel on it. `samples` are per pixel of the estimate.
+        Pixels beside the object have the value of the nearest pixel on it. `samples` are per pixel of the estimate. A
+        diffuse surface of normal n and reflectance a has the radiance a / π E · n while n stays near the mapped
+        normal. E excludes light from below the mapped normal's horizon and attenuates grazing light (GRAZING).
         Raises ValueError for lights of a scene file.
         """
-        return [light for light, _ in self._in_batches(camera, many, samples, seed, False)]
-
-    def pictures_and_vectors(
-        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
-    ) -> list[tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 9"]]]:
-        """`pictures`, with the vector irradiance E of indirect light at the first surface point: (9,) per pixel, world
-        x, y, z of red, then of green and blue.
-
-        A diffuse surface of normal n and reflectance a has the radiance a / π E · n while n stays near the mapped
-        normal. E excludes light from below the mapped normal's horizon and attenuates grazing light (GRAZING).
-        """
-        return self._in_batches(camera, many, samples, seed, True)
-
-    def _in_batches(
-        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
-    ) -> list[tuple[Any, Any]]:
-        """Pairs of radiance and vector irradiance; the latter is None without `vectors`."""
         pairs = []
         for k in range(0, len(many), TOGETHER):
             pairs += self._pictures(camera, many[k : k + TOGETHER], samples, seed, vectors)

@@ -4,11 +4,9 @@ Both lie in checkpoints. A later run repeats the pass and takes finished parts f
 same bytes. Every progress report of a pass is a point where it may be saved, stopped, or ended by its time limit.
 """
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -65,14 +63,10 @@ class Journal:
         """The names of interrupted parts under a prefix."""
         return [name for name in self.earlier if name.startswith(prefix)]
 
-    def recall(self, name: str) -> Arrays | None:
-        """The arrays that `poll` saved as `name` before an interruption."""
-        return self.earlier.pop(name, None)
-
     def poll(self, name: str = "", arrays: Callable[[], Arrays] | None = None) -> None:
         """Save if it is time or a stop was requested; then raise Stopped, or TimeOver after the first pass.
 
-        `arrays` are a part in progress, which `name` recalls.
+        `arrays` are a part in progress; after an interruption they are in `earlier` under `name`.
         """
         if stopping.asked() or time.monotonic() - self.saved > max(self.every, SELDOM * self.took):
             self.save({} if arrays is None else {name: arrays()})
@@ -92,16 +86,6 @@ class Journal:
         self.checkpoints.save(flat)
         self.saved = time.monotonic()
         self.took = self.saved - begun
-
-
-def text_array(value: Any) -> np.ndarray:
-    """A JSON value as bytes in an array."""
-    return np.frombuffer(json.dumps(value).encode(), np.uint8).copy()
-
-
-def text_value(array: np.ndarray) -> Any:
-    """The value of `text_array`."""
-    return json.loads(array.tobytes())
 
 
 def inside(arrays: Arrays, prefix: str) -> Arrays:

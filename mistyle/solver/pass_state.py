@@ -1,12 +1,13 @@
 """The state of a recovery between two passes, and its arrays in a checkpoint."""
 
+import json
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from mistyle.render.deferred.material_table import MaterialTable
 from mistyle.solver.context import DirectCaptures, FitContext
-from mistyle.solver.journal import Arrays, inside, text_array, text_value
+from mistyle.solver.journal import Arrays, inside
 from mistyle.solver.texels.records import Solution
 from mistyle.solver.texels.solve import TexelEstimate
 
@@ -34,7 +35,8 @@ class PassState:
 def arrays_of(state: PassState, context: FitContext) -> Arrays:
     """The arrays from which `state_from` restores the state, with notes and trace of the context."""
     words = {name: getattr(state, name) for name in ("done", "settled", "over")}
-    flat: Arrays = {"words": text_array(words | {"notes": context.notes, "trace": context.trace})}
+    text = json.dumps(words | {"notes": context.notes, "trace": context.trace})
+    flat: Arrays = {"words": np.frombuffer(text.encode(), np.uint8).copy()}
     flat |= {f"indirect.{k}": light for k, light in state.direct.indirect.items()}
     for name in ("solution", "estimate"):
         record = getattr(state, name)
@@ -45,7 +47,7 @@ def arrays_of(state: PassState, context: FitContext) -> Arrays:
 
 def state_from(arrays: Arrays, context: FitContext) -> PassState:
     """The state of `arrays_of`; notes and trace return into the context."""
-    words = text_value(arrays["words"])
+    words = json.loads(arrays["words"].tobytes())
     context.notes[:] = words["notes"]
     context.trace.clear()
     context.trace.update(words["trace"])

@@ -101,12 +101,9 @@ def tilt_variance(solution: Solution, observed: TexelObservations) -> Float[np.n
 
 def unconstrained_tilts(solution: Solution, observed: TexelObservations) -> Float[np.ndarray, "t 2"]:
     """Standard deviations of a texel's tilt under its observations alone."""
-    return likelihood(solution)[0][:, TILT] * inflation(solution, observed)
-
-
-def inflation(solution: Solution, observed: TexelObservations) -> Float[np.ndarray, "t 1"]:
-    """Factor of standard deviations: observations that fit badly are less certain than their number suggests."""
-    return np.sqrt(1 + solution.cost / np.maximum(observed.seen, 1))[:, None]
+    # Observations that fit badly are less certain than their number suggests.
+    inflation = np.sqrt(1 + solution.cost / np.maximum(observed.seen, 1))[:, None]
+    return likelihood(solution)[0][:, TILT] * inflation
 
 
 def neighbour_weight(solution: Solution, observed: TexelObservations) -> Values:

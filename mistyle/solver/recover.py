@@ -301,10 +301,8 @@ class _Work:
     def renderer(self, state: PassState | None) -> MaterialRenderer:
         """The renderer of the whole atlas, with the references of a state."""
         if self._renderer is None:
-            self._renderer, self._targets = (
-                self.context.renderer(gradients=descent_steps(self.context.settings) > 0),
-                None,
-            )
+            self._renderer = self.context.renderer(gradients=descent_steps(self.context.settings) > 0)
+            self._targets = None
         if state is not None and state.direct is not self._targets:
             self._renderer.retarget(state.direct.direct_only(), state.direct.pixel_confidence)
             self._targets = state.direct

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mistyle.atlas.neighbours import Links, within
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
@@ -44,7 +44,6 @@ STEPS, CLOSE = 300, 1e-4  # most iterations of conjugate gradients, and their re
 BAND, HALO = 2**20, 64
 
 Grid = Float[np.ndarray, "h w"]
-Line = Bool[np.ndarray, "h v"]  # texels with a neighbour on either side in their row
 Both = tuple[np.ndarray, np.ndarray]  # along rows, and along columns (transposed)
 
 
@@ -142,11 +141,6 @@ def _inner_texels(among: Links) -> Both:
     return among.right[:, :-1] & among.right[:, 1:], (among.below[:-1] & among.below[1:]).T
 
 
-def _second_differences(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
-    """Second differences along rows, the mean of two neighbours less the texel; 0 without both neighbours."""
-    return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
-
-
 def _estimate_variance(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
     """Errors of the estimate, and the surface's own variance of second differences, both from a local window.
 
@@ -159,7 +153,8 @@ def _estimate_variance(estimate: Grid, error: Grid, among: Links, least: float) 
         noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
         weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
         sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
-        for own, value in zip(sums, (_second_differences(x, link) ** 2, noise, 1), strict=True):
+        second = np.where(link, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
+        for own, value in zip(sums, (second**2, noise, 1), strict=True):
             own[:, 1:-1] += weight * value
     varies, noise, weights = diffused(total, among, AROUND)[..., 0]
     own = np.clip((varies - noise) / np.maximum(weights, 1e-12), least**2, MOST**2)

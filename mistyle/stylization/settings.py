@@ -26,16 +26,12 @@ READ_SAMPLES = 8  # per pixel of a view that a stylizer reads
 class DrawSettings(FrozenModel):
     """How the views of the mesh are rendered (paper 4.1.1)."""
 
-    spp: int = Field(
-        default=0,
-        ge=0,
-        le=65536,
-        description="samples per pixel of the rendered views; 0: 8 where a stylizer reads their colours, else 1",
-    )
-    scene: Path | None = Field(
-        default=None, description="a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"
-    )
-    paper_files: bool = Field(default=False, description="also write the 8-bit depth maps and Canny edges of the paper")
+    spp: int = Field(default=0, ge=0, le=65536)
+    """samples per pixel of the rendered views; 0: 8 where a stylizer reads their colours, else 1"""
+    scene: Path | None = None
+    """a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"""
+    paper_files: bool = False
+    """also write the 8-bit depth maps and Canny edges of the paper"""
 
     def samples(self, read: bool = True) -> int:
         """Samples per pixel; more if a stylizer reads the views' colours (`read`)."""
@@ -45,26 +41,19 @@ class DrawSettings(FrozenModel):
 class Settings(FrozenModel):
     """Settings of one job."""
 
-    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
-    threads: int = Field(
-        default=0, ge=0, le=1024, description="threads of the renderer and of torch; 0 takes all cores"
-    )
-    memory: float = Field(
-        default=0,
-        ge=0,
-        le=100_000,
-        description="GB of main memory that the job may use; 0: nine tenths of the available memory. Large arrays move "
-        "to files in its work folder if needed, with the same result; a job that still exceeds it is refused",
-    )
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    """every random choice follows from it"""
+    threads: int = Field(default=0, ge=0, le=1024)
+    """threads of the renderer and of torch; 0 takes all cores"""
+    memory: float = Field(default=0, ge=0, le=100_000)
+    """GB of main memory that the job may use; 0: nine tenths of the available memory. Large arrays move to files in its
+    work folder if needed, with the same result; a job that still exceeds it is refused"""
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
-    stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(
-        default="embedded",
-        description="embedded paints the surface once; embedded-view paints view after view from earlier ones; "
-        "diffusion does the same with SDXL (needs models)",
-    )
-    inpainter: Literal["fill", "paint3d"] = Field(
-        default="fill", description="fill reuses the painting; paint3d is Stable Diffusion (needs models)"
-    )
+    stylizer: Literal["embedded", "embedded-view", "diffusion"] = "embedded"
+    """embedded paints the surface once; embedded-view paints view after view from earlier ones; diffusion does the same
+    with SDXL (needs models)"""
+    inpainter: Literal["fill", "paint3d"] = "fill"
+    """fill reuses the painting; paint3d is Stable Diffusion (needs models)"""
     read: ReadSettings = ReadSettings()
     rig: RigSettings = RigSettings()
     draw: DrawSettings = DrawSettings()

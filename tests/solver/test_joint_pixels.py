@@ -75,7 +75,7 @@ def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far, met
         [context.captures.lights[0]],
     )
     mesh, sizes = context.traced.mesh, context.atlas.sizes
-    (light, vectors), *_ = Indirect(mesh, unpack(table, sizes)).pictures_and_vectors(camera, many, SAMPLES, 3)
+    (light, vectors), *_ = Indirect(mesh, unpack(table, sizes)).pictures(camera, many, SAMPLES, 3, vectors=True)
     derivative = joint_pixels.indirect_jacobian(pictures[0], light, vectors, camera.size, table[unknown.rows], axes)
     place = context.texels[0].position.reshape(-1, 3)
     lowest = context.texels[0].covered.ravel() & (place[:, 2] < -0.7)
@@ -84,7 +84,7 @@ def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far, met
     moves[np.ix_(lowest, columns)] = far
     real = []
     for moved in (table + moves, table - moves):
-        real.append(Indirect(mesh, unpack(moved, sizes)).pictures(camera, many, SAMPLES, 3)[0])
+        real.append(Indirect(mesh, unpack(moved, sizes)).pictures(camera, many, SAMPLES, 3)[0][0])
     real = ((real[0] - real[1]) / 2).reshape(-1, 3)
     told = np.zeros_like(real)
     told[pictures[0].index] = joint_pixels.indirect_delta(pictures[0], derivative, moves[unknown.rows])

@@ -340,7 +340,7 @@ def test_indirect_light_is_what_path_sees_beyond_direct(rng, monkeypatch, most):
     direct, whole = (
         photographs(mesh, [maps], [camera] * 2, many, "mikkt", path | {"max_depth": d}, 256) for d in (2, 5)
     )
-    found = Indirect(mesh, [maps]).pictures(camera, many, 256, 3)
+    found = [light for light, _ in Indirect(mesh, [maps]).pictures(camera, many, 256, 3)]
     for part, all_of_it, coarse in zip(direct, whole, found, strict=True):
         difference = all_of_it - part
         assert coarse.shape[:2] == ((64, 63) if most == MOST else (32, 32))
@@ -367,7 +367,7 @@ def test_what_mirrors_show_of_other_surfaces_is_in_the_estimate():
     direct, whole = (
         photographs(mesh, [maps], [camera], many, "mikkt", path | {"max_depth": depth}, 1024)[0] for depth in (2, 5)
     )
-    estimate = Indirect(mesh, [maps]).pictures(camera, many, 256, 3)[0]
+    estimate = Indirect(mesh, [maps]).pictures(camera, many, 256, 3)[0][0]
     shown = trace_gbuffer(draw.tracer(mesh), camera, []).position[..., 2] < -0.85
     difference = gaussian((whole - direct - estimate) * shown[..., None], 1.0)[shown]
     assert shown.sum() > 50
@@ -395,10 +395,10 @@ def test_pictures_of_one_place_share_their_paths(monkeypatch):
     camera = look_at([0.6, 0.4, 4], fov=30, size=(32, 32))
     many = [(directional(*light),) for light in LIGHTS[:3]]
     estimate = Indirect(mesh, [maps])
-    found = estimate.pictures(camera, many, 16, 3)
+    found = [light for light, _ in estimate.pictures(camera, many, 16, 3)]
     assert len(found) == len(many)
     for own, picture in zip(many, found, strict=True):
-        np.testing.assert_allclose(picture, estimate.pictures(camera, [own], 16, 3)[0], rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(picture, estimate.pictures(camera, [own], 16, 3)[0][0], rtol=1e-3, atol=1e-5)
     assert np.abs(found[0] - found[1]).max() > 0.01
 
 

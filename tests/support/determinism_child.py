@@ -135,7 +135,7 @@ def style_job(made: Stages, settings: Any) -> None:
 
 
 def repair(made: Stages, asset: Any, atlas: Any, baked: Any, fitted: Any, settings: Any) -> list[Any]:
-    from mistyle.stylization.inpaint.fill import inpainter
+    from mistyle.stylization.inpaint.fill import from_paint
     from mistyle.stylization.inpaint.repair import repair as repaired
     from mistyle.stylization.inpaint.repair import struggle_mask
 
@@ -146,7 +146,9 @@ def repair(made: Stages, asset: Any, atlas: Any, baked: Any, fitted: Any, settin
         looks = np.ones_like(struggle)
         mask = struggle_mask(struggle, looks, baked.seen[part], texels, settings.repair)
         rng = np.random.default_rng(0)
-        result.append(repaired(baked.maps[part], mask, texels, inpainter(), settings.repair, rng))
+        result.append(
+            repaired(baked.maps[part], mask, texels, from_paint(1 - baked.maps[part].albedo), settings.repair, rng)
+        )
     made.note("repair", result)
     return result
 
@@ -178,7 +180,8 @@ def usd_is_there() -> bool:
 
 def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any], settings: Any) -> None:
     """The stylizer of single views, the warp between them, and the bake from views."""
-    from mistyle.atlas.bake import bake
+    from mistyle.atlas.bake import backproject, fill
+    from mistyle.atlas.texels import pad
     from mistyle.stylization.mvst.lift import lift
     from mistyle.stylization.mvst.settings import WarpSettings
     from mistyle.stylization.mvst.sweep import ViewPainter, sweep
@@ -190,7 +193,9 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
     paint = stylizer_of(asset, style, atlas, chosen, nothing)
     made.note("one view", paint(views[0], None, np.random.default_rng(0)))
     swept = made.note("sweep", sweep(views[:3], ViewPainter(paint, keeps_outlines=True), chosen.sweep, 0))
-    made.note("bake from views", bake(swept.views, atlas.texels[0], chosen.bake, 4, mesh=asset.mesh))
+    projected = backproject(swept.views, atlas.texels[0], chosen.bake, mesh=asset.mesh)
+    filled = pad(fill(projected, atlas.texels[0]), atlas.texels[0], 4)
+    made.note("bake from views", [projected, filled])
 
 
 def compared(made: Stages) -> None:

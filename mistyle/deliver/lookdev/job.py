@@ -10,6 +10,7 @@ import datetime
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +38,24 @@ LIGHT_STEPS = 8  # pictures of the HDRI's rotation on the sheet
 class LookSettings(FrozenModel):
     """Settings of the sheet and the turntables."""
 
-    size: int = Field(default=USUAL, ge=64, le=4096, description="pixels of the sheet's largest pictures of the asset")
-    spp: int = Field(default=64, ge=1, le=65536, description="samples per pixel of the largest pictures")
-    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
-    turntable: int = Field(default=0, ge=0, le=720, description="frames of a turntable; 0: none")
-    hdri_turn: int = Field(default=0, ge=0, le=720, description="frames of the light's turn; 0: none")
-    frame: int = Field(default=512, ge=32, le=4096, description="pixels of a turntable's frame")
-    mp4: bool = Field(default=False, description="the turntables as mp4 too (needs mistyle[video])")
-    threads: int = Field(default=0, ge=0, le=1024, description="threads; 0 takes all cores")
-    variant: str = Field(default="auto", description="the Mitsuba variant")
+    size: int = Field(default=USUAL, ge=64, le=4096)
+    """pixels of the sheet's largest pictures of the asset"""
+    spp: int = Field(default=64, ge=1, le=65536)
+    """samples per pixel of the largest pictures"""
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    """every random choice follows from it"""
+    turntable: int = Field(default=0, ge=0, le=720)
+    """frames of a turntable; 0: none"""
+    hdri_turn: int = Field(default=0, ge=0, le=720)
+    """frames of the light's turn; 0: none"""
+    frame: int = Field(default=512, ge=32, le=4096)
+    """pixels of a turntable's frame"""
+    mp4: bool = False
+    """the turntables as mp4 too (needs mistyle[video])"""
+    threads: int = Field(default=0, ge=0, le=1024)
+    """threads; 0 takes all cores"""
+    variant: str = "auto"
+    """the Mitsuba variant"""
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ def write_turns(
 
     turns = {
         "turntable": (settings.turntable, stage.turn, lights[0]),
-        "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
+        "light_turn": (settings.hdri_turn, partial(stage.turn, of_light=True), lights[2]),
     }
     films = {}
     for name, (frames, draw, rig) in turns.items():

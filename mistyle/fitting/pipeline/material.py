@@ -410,7 +410,9 @@ def measure(
         valid = valid & (rendered[0][1] > 0.999)
         predicted = rendered[0][0]
         if indirect is not None:
-            light = indirect.pictures(captures.cameras[k], [captures.lights[k]], MEASURED_PATHS, settings.seed + k)[0]
+            light = indirect.pictures(captures.cameras[k], [captures.lights[k]], MEASURED_PATHS, settings.seed + k)[0][
+                0
+            ]
             predicted = predicted + enlarged(light, captures.cameras[k].size)
         if valid.any():
             errors.append(psnr(srgb_from_linear(rgb[valid]), srgb_from_linear(predicted[valid])))

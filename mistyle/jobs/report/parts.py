@@ -76,13 +76,13 @@ def setting_groups(settings: BaseModel) -> dict[str, tuple[Setting, ...]]:
                 Setting(
                     k,
                     str(getattr(value, k)),
-                    f.description or "",
+                    " ".join((f.description or "").split()),
                     getattr(value, k) != getattr(getattr(default, name), k),
                 )
                 for k, f in type(value).model_fields.items()
             )
         else:
-            meaning = root.model_fields[name].description or ""
+            meaning = " ".join((root.model_fields[name].description or "").split())
             alone.append(Setting(name, str(value), meaning, value != getattr(default, name)))
     return {"job": tuple(alone)} | groups
 

@@ -15,7 +15,6 @@ from mistyle.render.mitsuba.device import dr
 
 # Mitsuba's floor of the GGX alpha; roughness² below it has no effect and no gradient, in both models.
 ALPHA_FLOOR = 1e-3
-ROUGHNESS_FLOOR = ALPHA_FLOOR**0.5
 
 # A dielectric of index 1.5, as glTF fixes it: (0.5 / 2.5)².
 GLTF_F0 = 0.04
@@ -50,23 +49,13 @@ class Angles(NamedTuple):
     valid: Any
 
 
-def evaluate(
-    reflectance: Reflectance, wi: Any, wo: Any, normal: Any, albedo: Any, roughness: Any, metallic: Any
-) -> Any:
-    """f cos(theta_o) under the tangent-space `normal` (-1..1, any length > 0).
+def terms(reflectance: Reflectance, wi: Any, wo: Any, normal: Any, roughness: Any, metallic: Any) -> tuple[Any, Any]:
+    """Albedo-linear and constant term: f cos(theta_o) is albedo · linear + constant under the tangent-space `normal`
+    (-1..1, any length > 0). Several lights can be summed before multiplication by the albedo.
 
     Equals `mi.BSDF.eval` of twosided(normalmap(principled)) with its options flip_invalid_normals and
     use_shadowing_function: light or camera below the perturbed horizon give 0. `wi`, `wo` in the unperturbed frame, on
     either side of the surface.
-    """
-    linear, constant = terms(reflectance, wi, wo, normal, roughness, metallic)
-    return dr.fma(albedo, linear, constant)
-
-
-def terms(reflectance: Reflectance, wi: Any, wo: Any, normal: Any, roughness: Any, metallic: Any) -> tuple[Any, Any]:
-    """Albedo-linear and constant term: `evaluate` is albedo · linear + constant.
-
-    Several lights can be summed before multiplication by the albedo.
     """
     wo_z, wi_z = dr.mulsign(wo.z, wi.z), dr.abs(wi.z)
     x, y, z = normal.x, normal.y, normal.z

@@ -147,9 +147,7 @@ class Renderer:
         import torch
 
         def column(table: Mapping[str, Any], name: str, size: tuple[int, int]) -> Any:
-            value = table.get(name)
-            if value is None:
-                return torch.tensor(NEUTRAL[name]).expand(size[0] * size[1], -1)
+            value = table[name]
             flat = value if _is_torch(value) else torch.from_numpy(np.ascontiguousarray(value, np.float32))
             return flat.to("cpu", torch.float32).reshape(size[0] * size[1], -1)
 
@@ -179,7 +177,7 @@ class Renderer:
         weights = [mi.Float(aligned(column)) for column in weight.T]
         values = []
         for name, channels in torch_bridge.CHANNELS.items():
-            flat = [_drjit_map(table.get(name), name, size) for table, size in zip(tables, sizes, strict=True)]
+            flat = [_drjit_map(table[name]) for table in tables]
             whole = flat[0] if len(flat) == 1 else dr.concat(flat)
             for k in range(channels):
                 taps = [dr.gather(mi.Float, whole, t * channels + k) * w for t, w in zip(texels, weights, strict=True)]
@@ -189,7 +187,7 @@ class Renderer:
 
 
 def _maps_of(one: MapSet) -> dict[str, Any]:
-    """The maps by name, at least one, with consistent shapes."""
+    """All maps by name, neutral ones for those that are omitted; at least one with consistent shapes is given."""
     named = vars(one) if isinstance(one, Maps) else dict(one)
     unknown = sorted(set(named) - {*NEUTRAL, "known"})
     maps = {name: named[name] for name in NEUTRAL if name in named}
@@ -200,7 +198,8 @@ def _maps_of(one: MapSet) -> dict[str, Any]:
         shape, channels = tuple(value.shape), len(NEUTRAL[name])
         if shape not in {(*size, channels), size if channels == 1 else None}:
             raise ValueError(f"{name} has the shape {shape}; expected {(*size, 3) if channels == 3 else size}")
-    return maps
+    neutral = {name: np.broadcast_to(np.float32(value), (*size, len(value))) for name, value in NEUTRAL.items()}
+    return neutral | maps
 
 
 def _size(maps: Mapping[str, Any]) -> tuple[int, int]:
@@ -219,15 +218,9 @@ def _is_drjit(value: Any) -> bool:
 
 def _numpy_table(maps: Mapping[str, Any], size: tuple[int, int]) -> Float[np.ndarray, "t 8"]:
     count = size[0] * size[1]
-    columns = [
-        np.broadcast_to(maps[name].reshape(count, -1) if name in maps else np.array(NEUTRAL[name]), (count, channels))
-        for name, channels in torch_bridge.CHANNELS.items()
-    ]
-    return np.concatenate(columns, axis=1, dtype=np.float32)
+    return np.concatenate([maps[name].reshape(count, -1) for name in torch_bridge.CHANNELS], axis=1, dtype=np.float32)
 
 
-def _drjit_map(value: Any, name: str, size: tuple[int, int]) -> Any:
+def _drjit_map(value: Any) -> Any:
     """The flat values of one map."""
-    if value is None:
-        value = np.broadcast_to(np.float32(NEUTRAL[name]), (size[0] * size[1], len(NEUTRAL[name])))
     return value.array if _is_drjit(value) else mi.Float(aligned(np.asarray(value, np.float32).ravel()))

@@ -144,9 +144,7 @@ class SampleBlock:
 
 def tangents_of(mesh: Mesh, frame: FrameKind) -> Float[np.ndarray, "f 3 4"] | None:
     """Tangents of a frame for `collect`: MikkTSpace's per face corner, or None for Mitsuba's own."""
-    if frame == "mitsuba":
-        return None
-    return corner_tangents(mesh)
+    return None if frame == "mitsuba" else corner_tangents(mesh)
 
 
 def grid(subsamples: int) -> Float[np.ndarray, "s 2"]:

@@ -126,22 +126,17 @@ def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = T
                 f"{type(source).__name__} cannot be summed exactly; expected directional, point or ambient light"
             )
     glow = (float(ambient[0]), float(ambient[1]), float(ambient[2])) if ambient.any() else None
-    return _lit(traced, surface, beams, glow, shadows)
+    return light_rows(traced, surface, beams, glow, shadows)
 
 
-def light_each(traced: Tracer, surface: Surface, beams: Sequence[Directional], *, shadows: bool = True) -> Lit:
-    """One directional light for each camera, alone."""
-    return _lit(traced, surface, [list(beams)], None, shadows)
-
-
-def _lit(
+def light_rows(
     traced: Tracer,
     surface: Surface,
     beams: Sequence[Sequence[Directional] | Sequence[Point]],
     ambient: tuple[float, float, float] | None,
     shadows: bool,
 ) -> Lit:
-    """`beams` holds rows of one light per camera."""
+    """As `light`; `beams` holds rows of one light per camera."""
     height, width = surface.cameras[0].size
     valid = surface.point.is_valid()
     camera_of = dr.arange(mi.UInt32, len(surface.mask)) // (height * width)
@@ -173,7 +168,7 @@ def _beam(surface: Surface, row: Sequence[Directional] | Sequence[Point], camera
     return way * dr.rsqrt(squared), intensity / squared, surface.point.spawn_ray_to(place)
 
 
-def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[Any, Any]]:
+def ambient_directions(wi: Any) -> list[tuple[Any, Any]]:
     """Directions and weights with which a constant radiance sums to the light scattered towards `wi` (tangent frame).
 
     Spherical Fibonacci points: half follow the cosine about the shading normal, half a GGX lobe of LOBE_ALPHA about the
@@ -182,6 +177,7 @@ def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[A
     """
     side = dr.mulsign(mi.Float(1), wi.z)
     wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
+    count = AMBIENT_DIRECTIONS
     lobes, cosines = count // 2, count - count // 2
     golden, a2 = np.pi * (3 - np.sqrt(5)), LOBE_ALPHA**2
     directions = []

@@ -175,10 +175,7 @@ def _to_texels(table, packed, transpose) -> Any:
         return k + 1, dr.fma(weight, dr.gather(mi.ArrayXf, packed, sample, shape=(8, width)), total)
 
     _, total = dr.while_loop((mi.UInt32(transpose.begin), total), lambda k, total: k < transpose.end, add)
-    x, y = (
-        dr.gather(mi.Float, table, transpose.texel * COLUMNS + TILT_X),
-        dr.gather(mi.Float, table, transpose.texel * COLUMNS + TILT_Y),
-    )
+    x, y = (dr.gather(mi.Float, table, transpose.texel * COLUMNS + c) for c in (TILT_X, TILT_Y))
     z = _tilted_z(x, y)
     lean = dr.select(z > LEAST_Z, total[5] / z, 0)
     rows = [total[0], total[1], total[2], total[3] - lean * x, total[4] - lean * y, total[6], total[7], mi.Float(0)]
@@ -193,21 +190,16 @@ def add_rows(gradient: Any, rows: Any, transpose: Transpose) -> None:
     dr.scatter_add(gradient, values, transpose.texel, active=used, mode=dr.ReduceMode.NoConflicts)
 
 
-def _l2(image: Any, reference: Any) -> Any:
-    return dr.sum(dr.square(image - reference))
-
-
-def _log_srgb_l1(image: Any, reference: Any) -> Any:
-    return dr.sum(dr.abs(_log_srgb(image) - _log_srgb(reference)))
-
-
 def _log_srgb(x: Any) -> Any:
     x = dr.log(1 + dr.maximum(x, 0))
     dark = x <= 0.0031308
     return dr.select(dark, 12.92 * x, 1.055 * dr.power(dr.select(dark, 1, x), 1 / 2.4) - 0.055)
 
 
-LOSSES: dict[str, Callable[[Any, Any], Any]] = {"l2": _l2, "log_srgb_l1": _log_srgb_l1}
+LOSSES: dict[str, Callable[[Any, Any], Any]] = {
+    "l2": lambda image, reference: dr.sum(dr.square(image - reference)),
+    "log_srgb_l1": lambda image, reference: dr.sum(dr.abs(_log_srgb(image) - _log_srgb(reference))),
+}
 
 
 # Directions per sample about the mirror direction, in addition to the sky's cells, and the lobe's least GGX alpha.

@@ -197,7 +197,8 @@ class MaterialRenderer:
         for k in pictures:
             for block in self.blocks(k):
                 run = self._function(block, loss, kernels.step, self._terms, self.subsamples, loss)
-                scale = self._scale(1 / (3 * np.prod(self.captures.cameras[k].size) * len(pictures)))
+                # Opaque: a literal in a frozen function would be recorded again for each value.
+                scale = dr.opaque(mi.Float, float(1 / (3 * np.prod(self.captures.cameras[k].size) * len(pictures))))
                 assert block.arrays.transpose is not None
                 value, rows = run(textures, block.arrays, (block.target, scale))
                 total += value + block.dark[loss] * scale
@@ -227,13 +228,8 @@ class MaterialRenderer:
         dr.make_opaque(gradient)
         return gradient
 
-    def _scale(self, value: float) -> Any:
-        """An opaque number: a literal in a frozen function would be recorded again for each value."""
-        return dr.opaque(mi.Float, float(value))
-
     def _function(self, block: "Block", name: str, function: Callable, *fixed: Any) -> Any:
         """`function` with its fixed arguments, frozen once per size of arrays (sizes are constants of a recording)."""
-
         if not self.options.freeze:
             return lambda *arguments: function(*fixed, *arguments)
         key = (name, *block.widths)

@@ -24,6 +24,7 @@ from mistyle.core.drjit_arrays import LANES, aligned
 from mistyle.core.maps import flat_maps
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import split
+from mistyle.render.deferred.image_samples import bilinear_footprint, bilinear_taps
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.device import dr, mi
@@ -45,31 +46,17 @@ class Taps:
 
 
 def taps(surface: deferred.Surface, sizes: Sequence[tuple[int, int]]) -> Taps:
-    """The bilinear fetch of every pixel of `surface` from texture sets of `sizes` (rows, columns).
-
-    Texel centres at +0.5, row 0 is v = 1, textures repeat: exactly as in Mitsuba's bitmap texture.
-    """
-    offsets = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in sizes])])
-    on = np.flatnonzero(surface.mask)
-    part = surface.part[on]
-    rows, columns = np.asarray(sizes, np.int64)[part].T
-    x = surface.uv[on, 0].astype(np.float64) * columns - 0.5
-    y = (1 - surface.uv[on, 1].astype(np.float64)) * rows - 0.5
-    x0, y0 = np.floor(x), np.floor(y)
-    fx, fy = x - x0, y - y0
-    left, top = x0.astype(np.int64) % columns, y0.astype(np.int64) % rows
-    right, bottom = (left + 1) % columns, (top + 1) % rows
-    start = offsets[part]
-    index = np.stack([start + r * columns + c for r in (top, bottom) for c in (left, right)], axis=1)
-    weight = np.stack([a * b for a in (1 - fy, fy) for b in (1 - fx, fx)], axis=1).astype(np.float32)
-    touched = np.zeros(offsets[-1], bool)
+    """The bilinear fetch of every pixel of `surface` from texture sets of `sizes` (rows, columns)."""
+    on, count = np.flatnonzero(surface.mask), sum(rows * columns for rows, columns in sizes)
+    index, weight = bilinear_taps(*bilinear_footprint(surface.uv[on], surface.part[on], sizes), sizes)
+    touched = np.zeros(count, bool)
     touched[index] = True
     texels = np.flatnonzero(touched)
-    local = np.zeros(offsets[-1], np.int32)
+    local = np.zeros(count, np.int32)
     local[texels] = np.arange(len(texels), dtype=np.int32)
     pointer = np.concatenate([[0], np.cumsum(np.where(surface.mask, 4, 0))])
-    shape = (len(surface.mask), len(texels))
-    return Taps(texels, sparse.csr_matrix((weight.ravel(), local[index].ravel(), pointer), shape=shape))
+    values = weight.astype(np.float32).ravel(), local[index].ravel(), pointer
+    return Taps(texels, sparse.csr_matrix(values, shape=(len(surface.mask), len(texels))))
 
 
 def fetch(values: Any, where: Taps) -> Any:

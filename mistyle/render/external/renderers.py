@@ -188,7 +188,6 @@ _SHAPES: list[tuple[Any, Any]] = []
 
 
 def _shapes(source: Subject) -> Any:
-
     if not _SHAPES or _SHAPES[0][0] is not source.asset:
         _SHAPES[:] = [(source.asset, asset_shapes(source.asset))]
     return _SHAPES[0][1]

@@ -76,9 +76,14 @@ def edits_of(
     if at is None:
         return "its element could not be found in the text."
     if literal is None:
-        edits = _file_edits(elements, at, file)
+        # An 8-bit or 16-bit format would round the file's values.
+        edits = _file_edits(elements, at, file, "format")
+        edits = edits or "its texture has no file name that could be replaced."
     elif p.kind == "attribute":
-        edits = _mesh_edits(elements, at, file)
+        # The written mesh's vertices are in world space already.
+        edits = _file_edits(elements, at, file, "to_world") if elements[at].attributes.get("type") == "ply" else []
+        where = file.name if file else "nothing"
+        edits = edits or f"only a mesh that comes from a PLY can be replaced; it was written as {where}."
     elif p.kind != "value":
         return f"a scene file cannot store it; it was written as {file.name if file else 'nothing'}."
     else:
@@ -107,15 +112,14 @@ def _outside(index: float | str) -> float:
     return 1 / float(mi.traverse(glass)["eta"])
 
 
-def _file_edits(elements: Sequence[Element], at: int, file: Path | None) -> list[Edit] | str:
-    """The written file replaces a texture's."""
+def _file_edits(elements: Sequence[Element], at: int, file: Path | None, dropped: str) -> list[Edit]:
+    """The written file replaces an element's, whose property `dropped` goes; none where there is no such file."""
     inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
     if file is None or "filename" not in inner:
-        return "its texture has no file name that could be replaced."
+        return []
     old = inner["filename"]
-    # An 8-bit or 16-bit format would round the file's values.
-    dropped = [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
-    return [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>'), *dropped]
+    gone = [(inner[dropped].begin, inner[dropped].end, "")] if dropped in inner else []
+    return [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>'), *gone]
 
 
 def _literal_edits(
@@ -144,15 +148,3 @@ def _literal_edits(
             slash = (element.end - 2, element.end - 1, "")
             edits += [slash, (element.end, element.end, text), (element.end, element.end, f"</{element.tag}>")]
     return edits
-
-
-def _mesh_edits(elements: Sequence[Element], at: int, file: Path | None) -> list[Edit] | str:
-    """The written mesh replaces a PLY mesh; its vertices are in world space already."""
-    inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
-    if file is None or elements[at].attributes.get("type") != "ply" or "filename" not in inner:
-        return (
-            f"only a mesh that comes from a PLY can be replaced; it was written as {file.name if file else 'nothing'}."
-        )
-    old = inner["filename"]
-    moved = [(inner["to_world"].begin, inner["to_world"].end, "")] if "to_world" in inner else []
-    return [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>'), *moved]

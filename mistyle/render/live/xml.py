@@ -233,7 +233,8 @@ def _write_value(
     """Write an image as EXR, or a mesh's attribute as PLY in world space; numbers and colours need no file."""
     if p.kind == "texture" and values.ndim == 3 and values.shape[2] <= 4:
         file = out.with_name(f"{out.stem}_{stem}.exr")
-        shown = _without_seam(values) if p.owner == "EnvironmentMapEmitter" else values
+        # Mitsuba repeats a column of an environment map at either end.
+        shown = np.ascontiguousarray(values[:, 1:-1, :3]) if p.owner == "EnvironmentMapEmitter" else values
         names = "Y" if shown.shape[2] == 1 else "RGBA"[: shown.shape[2]]
         data = {"colorInteropID": "data"} if p.owner == "NormalMap" or shown.shape[2] == 1 else None
         write_exr(file, {name: shown[..., k] for k, name in enumerate(names)}, attributes=data)
@@ -249,11 +250,6 @@ def _write_value(
     file = out.with_name(f"{out.stem}_{stem}.npy")
     np.save(file, values)
     return {p.key: file}
-
-
-def _without_seam(values: np.ndarray) -> np.ndarray:
-    """An environment map without the columns that Mitsuba repeats at either end."""
-    return np.ascontiguousarray(values[:, 1:-1, :3])
 
 
 def _differences(out: Path, fitted: Any, chosen: Sequence[Parameter]) -> str:

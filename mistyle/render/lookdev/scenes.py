@@ -38,11 +38,10 @@ ROWS = 512
 # Programs for other environments' Pythons, which do not import mistyle.
 EXTERNAL = PACKAGE / "render" / "external"
 CYCLES_WORKER, MITSUBA_WORKER = (str(EXTERNAL / f"{n}_worker.py") for n in ("cycles", "mitsuba"))
-LIGHTS = ("studio", "key", "grazing")
 
 
 def light_rig(name: str, read: Any) -> Lights:
-    """One of LIGHTS, or an .hdr or .exr environment map read by `read(path)`.
+    """One of these, or an .hdr or .exr environment map read by `read(path)`.
 
     studio   the softboxes of scenes/studio.xml
     key      a hard light of irradiance 2.5 from the upper left, ambient radiance 0.15

@@ -191,24 +191,22 @@ class Stage:
         return drawn(asset_scene(self.shapes, camera, (turned,), "path"), 0, spp, seed)
 
     def turn(
-        self, frames: int, light: Environment, size: int, spp: int, seed: int, progress: Callable[[float], None]
+        self,
+        frames: int,
+        light: Environment,
+        size: int,
+        spp: int,
+        seed: int,
+        progress: Callable[[float], None],
+        of_light: bool = False,
     ) -> list[Float[np.ndarray, "h w 4"]]:
-        """The asset turned by a full circle; camera and light are fixed."""
-        pictures = []
-        for k in range(frames):
-            pictures.append(self.picture(CAMERAS["3/4"][0] + 360 * k / frames, 12.0, light, size, spp, seed))
-            progress((k + 1) / frames)
-        return pictures
-
-    def light_turn(
-        self, frames: int, light: Environment, size: int, spp: int, seed: int, progress: Callable[[float], None]
-    ) -> list[Float[np.ndarray, "h w 4"]]:
-        """The light turned by a full circle; camera and asset are fixed."""
-        pictures = []
-        for k in range(frames):
-            turned = replace(light, turn=light.turn + 360 * k / frames)
-            pictures.append(self.picture(*CAMERAS["3/4"], turned, size, spp, seed))
-            progress((k + 1) / frames)
+        """The asset, or with `of_light` the light, turned by a full circle; the camera and the other are fixed."""
+        (azimuth, elevation), pictures = CAMERAS["3/4"], []
+        for angle in (360 * k / frames for k in range(frames)):
+            turned = azimuth, elevation, replace(light, turn=light.turn + angle)
+            shown = turned if of_light else (azimuth + angle, 12.0, light)
+            pictures.append(self.picture(*shown, size, spp, seed))
+            progress(len(pictures) / frames)
         return pictures
 
 

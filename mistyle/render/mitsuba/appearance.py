@@ -69,7 +69,10 @@ def shapes(asset: Asset, maps: list[OwnMaps]) -> dict[str, Any]:
     tangents = corner_tangents(asset.mesh)
     present = [p for p in range(len(asset.mesh.parts)) if (asset.mesh.part == p).any()]
     plain = [p for p in present if is_plain(asset.materials[p])]
-    result = {f"part{p}": scenery.object_shape(asset.mesh, p, maps[p], tangents) for p in plain}
+    result = {}
+    for p in plain:
+        surface = mi.load_dict(scenery.bsdf_dict(maps[p], True, model="gltf", frame="mikkt"))
+        result[f"part{p}"] = scenery.mitsuba_mesh(asset.mesh, p, surface, f"part{p}", tangents=tangents)
     result |= {f"part{p}": shape_of(asset, p, maps[p], tangents) for p in present if p not in plain}
     return {f"part{p}": result[f"part{p}"] for p in present}
 
@@ -229,13 +232,7 @@ def _path_class() -> type:
                 mi.Bool(False),
             )
 
-            def going(*state):
-                return state[2]
-
-            def step(*state):
-                return _next_surface(scene, self.depth, state)
-
-            state = dr.while_loop(state, going, step, labels=LABELS)
+            state = dr.while_loop(state, lambda *s: s[2], lambda *s: _next_surface(scene, self.depth, s), labels=LABELS)
             return state[5], state[10], []
 
         def to_string(self):

@@ -169,21 +169,12 @@ def object_shapes(
         raise ValueError(
             f"{len(chosen)} maps for {len(mesh.parts)} texture sets; expected one for each ({', '.join(mesh.parts)})"
         )
-    tangents = None
-    if frame == "mikkt":
-        tangents = corner_tangents(mesh)
-    shapes = {}
+    tangents, shapes = corner_tangents(mesh) if frame == "mikkt" else None, {}
     for p in range(len(mesh.parts)):
         if (mesh.part == p).any():
             bsdf = mi.load_dict(bsdf_dict(chosen[p], flip_invalid, model=model, frame=frame))
             shapes[f"part{p}"] = mitsuba_mesh(mesh, p, bsdf, f"part{p}", tangents=tangents)
     return shapes
-
-
-def object_shape(mesh: Mesh, part: int, maps: Maps, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
-    """One texture set of `object_shapes` with glTF's model in MikkTSpace frames, for pictures."""
-    bsdf = mi.load_dict(bsdf_dict(maps, True, model="gltf", frame="mikkt"))
-    return mitsuba_mesh(mesh, part, bsdf, f"part{part}", tangents=tangents)
 
 
 def samples(spp: int) -> int:

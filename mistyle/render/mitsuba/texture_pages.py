@@ -32,14 +32,9 @@ def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -
         )
     plugins.register()
     pages = _pages_class()
-    textures = {name: _texture(pages, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}
-    bsdf = {
-        "type": "principled",
-        "base_color": textures["albedo"],
-        "roughness": textures["roughness"],
-        "metallic": textures["metallic"],
-        "specular": 0.5,
-    }
+    slots = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
+    textures = {slot: _texture(pages, [getattr(m, name) for m in maps]) for slot, name in slots.items()}
+    bsdf = {"type": "principled", **textures, "specular": 0.5}
     relief = {
         "type": plugins.NORMALMAP,
         "normalmap": _texture(pages, [m.normal for m in maps], scenery.encoded_into),
@@ -105,10 +100,7 @@ def _pages_class() -> type:
         def _lookup(self, si, active):
             page = mi.UInt32(si.shape.eval_attribute_1(PAGE, si, active))
             start = dr.gather(mi.UInt32, self.start, page, active)
-            height, width = (
-                dr.gather(mi.UInt32, self.height, page, active),
-                dr.gather(mi.UInt32, self.width, page, active),
-            )
+            height, width = (dr.gather(mi.UInt32, size, page, active) for size in (self.height, self.width))
             left, right, tx = _neighbours(si.uv.x, width)
             above, below, ty = _neighbours(si.uv.y, height)
             kind = mi.Float if self.channels == 1 else mi.Color3f

@@ -62,7 +62,7 @@ def image_footprints(
     for group in by_camera(cameras):
         every = _covered_pixels(context, renderer, cameras[group[0]]) if settings.bounces else None
         for k in group:
-            lit = _lit_pixels(renderer, k)
+            lit = _footprint((block.hits for block in renderer.blocks(k)), renderer.sizes, renderer.subsamples)
             images[k] = lit if every is None else _with_unlit(lit, every)
             fetch = images[k].fetch
             seen[fetch.indices] = True
@@ -77,11 +77,6 @@ def image_footprints(
         pixels.fetch.indices = number[pixels.fetch.indices]
         pixels.fetch.resize(pixels.fetch.shape[0], len(rows))
     return result, UnknownTexels(rows, seen[rows]), left
-
-
-def _lit_pixels(renderer: MaterialRenderer, picture: int) -> ImageFootprint:
-    """Pixels that a light reaches."""
-    return _footprint((block.hits for block in renderer.blocks(picture)), renderer.sizes, renderer.subsamples)
 
 
 def _covered_pixels(context: FitContext, renderer: MaterialRenderer, camera: Camera) -> ImageFootprint:
@@ -142,7 +137,7 @@ def indirect_jacobian(
     axes: Frames,
 ) -> Float[np.ndarray, "p 3 3"]:
     """Derivatives of indirect light in a picture of `size`: of each channel by its own albedo and by the tilt (2).
-    `light` and `vectors` as from `Indirect.pictures_and_vectors`; `values` and `axes` of the unknown texels."""
+    `light` and `vectors` as from `Indirect.pictures`; `values` and `axes` of the unknown texels."""
     arriving = enlarged(vectors, size).reshape(-1, 3, 3)[pixels.index]
     frame = (pixels.fetch @ axes).reshape(-1, 3, 3)
     frame /= np.maximum(np.linalg.norm(frame, axis=2, keepdims=True), 1e-6)

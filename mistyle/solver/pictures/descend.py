@@ -7,7 +7,6 @@ corrects them by the pictures.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -106,7 +105,12 @@ def _descend(
     journal: Journal,
 ) -> MaterialTable:
     """The steps of a pass from the table of `run`; the rate falls to zero along a cosine."""
-    settings, count, (base, one), resume = context.settings, len(context.captures), run, journal.recall("adam")
+    settings, count, (base, one), resume = (
+        context.settings,
+        len(context.captures),
+        run,
+        journal.earlier.pop("adam", None),
+    )
     descent = _descent(context, estimate)
     table, first, pending, own = table_on_device(base), one.begin, [], []
     if resume is not None:
@@ -115,7 +119,8 @@ def _descend(
 
     def state() -> dict[str, np.ndarray]:
         flush()
-        return _state(descent, table, done, own)
+        reached = {"iteration": np.array(done), "losses": np.array(own)}
+        return descent.state() | reached | {"table": np.array(table).reshape(-1, COLUMNS)}
 
     def flush() -> None:
         own.extend(float(np.array(value)[0]) for value in pending)
@@ -140,7 +145,6 @@ def _descend(
 
 
 def _descent(context: FitContext, estimate: TexelEstimate) -> Descent:
-
     settings, solved = context.settings, estimate.solved
     rates = [1.0, 1, 1, 1, 1, 1, 1 if settings.metallic else 0, 0]
     rates = [rate * share for rate, share in zip(rates, SOLVED_RATES if solved else UNSOLVED_RATES, strict=True)]
@@ -148,12 +152,6 @@ def _descent(context: FitContext, estimate: TexelEstimate) -> Descent:
     return Descent(
         context.atlas.sizes, rates, options, shares=_rate_factors(estimate, context.atlas) if solved else None
     )
-
-
-def _state(descent: Descent, table: Any, step: int, losses: list[float]) -> dict[str, np.ndarray]:
-    """The arrays from which a later run resumes at `step`."""
-    own = {"iteration": np.array(step), "losses": np.array(losses)}
-    return descent.state() | own | {"table": np.array(table).reshape(-1, COLUMNS)}
 
 
 def _unconstrained_std(estimate: TexelEstimate) -> Float[np.ndarray, "a 7"]:

@@ -87,30 +87,28 @@ def _descend(
 ) -> None:
     """All remaining steps; ends early if the callback returns true."""
     saved, stopped = time.monotonic(), False
+
+    def store() -> None:
+        if save is not None:
+            save(scene_job.checkpoint(state, job))
+
     while state.iteration < job.plan.iterations and not stopped:
         with device.plain_errors(DOING):
             if not job.newton:
                 _step(job, state)
             elif not scene_newton.advance(job, state, lambda step, slot: _camera(job, step, slot)):
-                _interrupted(job, state, save)
+                store()
+                stopping.check()
         progress(state.iteration / job.plan.iterations)
         try:
             stopped = callback is not None and bool(callback(state.iteration - 1, state.trace[-1], dict(state.values)))
         except BaseException:
-            if save is not None:
-                save(scene_job.checkpoint(state, job))
+            store()
             raise
         if save is not None and (stopped or stopping.asked() or time.monotonic() - saved >= save_every):
-            save(scene_job.checkpoint(state, job))
+            store()
             saved = time.monotonic()
             stopping.check()
-
-
-def _interrupted(job: scene_job.SceneProblem, state: scene_job.FitState, save: Any) -> None:
-    """Save the state before an unfinished round, after a request to stop."""
-    if save is not None:
-        save(scene_job.checkpoint(state, job))
-    stopping.check()
 
 
 def _finished(

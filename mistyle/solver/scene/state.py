@@ -148,7 +148,13 @@ def prepare(
     table.properties = {p.key: table.properties[p.key] for p in chosen}
     free = _free_masks(chosen, unknowns.only or {})
     scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
-    quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not requested.")
+    quick, why = None, "it was not requested."
+    if fast:
+        try:
+            named = loss or "log_srgb_l1"
+            quick = DeferredRenderer(scene, chosen, views, named if isinstance(named, str) else "", engine)
+        except Unsupported as reason:
+            why = str(reason)
     if loss is None:
         loss = "relative" if quick is None else "log_srgb_l1"
     unsuited = "regularizers came" if regularizers else scene_newton.refusal(chosen, free, views, loss)
@@ -189,14 +195,6 @@ def _free_masks(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> 
     return free
 
 
-def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
-    """The fast path, or the reason why it does not apply."""
-    try:
-        return DeferredRenderer(scene, chosen, views, loss if isinstance(loss, str) else "", engine), ""
-    except Unsupported as reason:
-        return None, str(reason)
-
-
 def _views(scene: Any, sensors: Sequence[Any] | None, references: Sequence[np.ndarray], masks: Any):
     own = scene.sensors()
     cameras = []
@@ -230,14 +228,10 @@ def _scale(parameter: Parameter, values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))) or 1.0
 
 
-def first(parameter: Parameter, job: SceneProblem) -> np.ndarray:
-    values = scene_grad.array(job.table[parameter.key], parameter)
-    return np.where(job.free[parameter.key], scene_keys.project(parameter, values), values)
-
-
 def begun(job: SceneProblem) -> FitState:
     """The state before the first step."""
-    values = {p.key: first(p, job) for p in job.chosen}
+    stored = {p.key: scene_grad.array(job.table[p.key], p) for p in job.chosen}
+    values = {p.key: np.where(job.free[p.key], scene_keys.project(p, stored[p.key]), stored[p.key]) for p in job.chosen}
     moments = {p.key: laplacian.start(p.shape, job.plan.pyramid) for p in job.chosen}
     held = {p.key: np.zeros(p.shape, bool) for p in job.chosen}
     tail = {p.key: np.zeros(p.shape) for p in job.chosen}

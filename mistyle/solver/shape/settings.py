@@ -20,24 +20,14 @@ def share(value: Any) -> Any:
 class DisplaceSettings(FrozenModel):
     """How far and how smoothly the mesh follows the outlines of stylized views (paper 6.2.2)."""
 
-    most: Annotated[float, BeforeValidator(share)] = Field(
-        default=0.0,
-        ge=0,
-        le=0.5,
-        description="how far a vertex may move, as a share of the mesh's bounding radius (0.02 or '2%'); 0: the mesh "
-        "stays unchanged",
-    )
-    along: Literal["any", "normal"] = Field(
-        default="any", description="directions of the displacement: any, or only the vertex's normal"
-    )
-    smooth: float = Field(
-        default=0.015,
-        ge=0.002,
-        le=0.5,
-        description="size of the smallest feature of an outline that the mesh follows, in bounding radii",
-    )
-    height_map: bool = Field(
-        default=False,
-        description="also write the painting's relief as a height map (16-bit PNG, EXR); it does not move vertices",
-    )
-    steps: int = Field(default=30, ge=1, le=500, description="most Gauss-Newton steps")
+    most: Annotated[float, BeforeValidator(share)] = Field(default=0.0, ge=0, le=0.5)
+    """how far a vertex may move, as a share of the mesh's bounding radius (0.02 or '2%'); 0: the mesh stays
+    unchanged"""
+    along: Literal["any", "normal"] = "any"
+    """directions of the displacement: any, or only the vertex's normal"""
+    smooth: float = Field(default=0.015, ge=0.002, le=0.5)
+    """size of the smallest feature of an outline that the mesh follows, in bounding radii"""
+    height_map: bool = False
+    """also write the painting's relief as a height map (16-bit PNG, EXR); it does not move vertices"""
+    steps: int = Field(default=30, ge=1, le=500)
+    """most Gauss-Newton steps"""

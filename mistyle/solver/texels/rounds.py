@@ -211,11 +211,8 @@ def best(solutions: Sequence[Candidate]) -> Candidate:
 
 def chosen_of(choice: Bool[np.ndarray, " t"], a: Solution, b: Solution) -> Solution:
     """Solution `a` where `choice`, else `b`."""
-    return Solution(**{f.name: _select(choice, getattr(a, f.name), getattr(b, f.name)) for f in fields(Solution)})
-
-
-def _select(choice: Bool[np.ndarray, " t"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.where(choice.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+    pairs = {f.name: (getattr(a, f.name), getattr(b, f.name)) for f in fields(Solution)}
+    return Solution(**{n: np.where(choice.reshape(-1, *[1] * (x.ndim - 1)), x, y) for n, (x, y) in pairs.items()})
 
 
 def _is_metal(values: Values) -> Float[np.ndarray, " t"]:

@@ -118,7 +118,6 @@ def _level(
     start: Sequence[Maps] | None,
     progress: Callable[[float], None],
 ) -> TexelLevel:
-
     settings = context.settings
     options = ObservationOptions(settings.facing, settings.noise, settings.relative, settings.solver != "pictures")
     observed = collect_observations(
@@ -300,7 +299,7 @@ def estimate_indirect(
     skip: Collection[int] = (),
 ) -> Iterator[tuple[int, Radiance, Float[np.ndarray, "h w 9"] | None]]:
     """Each picture's number, its indirect light under the maps of `table`, and with `vectors` its vector irradiance
-    (`Indirect.pictures_and_vectors`); camera by camera, without cameras whose pictures are all in `skip`. `sampling`:
+    (`Indirect.pictures`); camera by camera, without cameras whose pictures are all in `skip`. `sampling`:
     samples a pixel and seed."""
     settings, captures, done, (samples, seed) = context.settings, context.captures, 0, sampling
     uploaded, maps = renderer.upload(table), unpack(table, context.atlas.sizes)
@@ -311,11 +310,7 @@ def estimate_indirect(
             continue
         many = [captures.lights[k] for k in group]
         request = (context.cameras or captures.cameras)[group[0]], many, samples, seed + len(captures) * group[0]
-        lights: list[tuple[np.ndarray, Any]]
-        lights = (
-            scene.pictures_and_vectors(*request) if vectors else [(light, None) for light in scene.pictures(*request)]
-        )
-        for k, (light, vector) in zip(group, lights, strict=True):
+        for k, (light, vector) in zip(group, scene.pictures(*request, vectors=vectors), strict=True):
             rgb, mask = captures.load(k)
             counts = (mask & np.isfinite(rgb).all(axis=-1))[..., None]
             yield k, in_proportion(light, renderer.image(uploaded, k) * counts, np.where(counts, rgb, 0)), vector

@@ -82,11 +82,6 @@ def noisy(
     return alpha_bar.sqrt() * z0 + (1 - alpha_bar).sqrt() * noise
 
 
-def epsilon_loss(eps: Float[torch.Tensor, "b c h w"], noise: Float[torch.Tensor, "b c h w"]) -> Float[torch.Tensor, ""]:
-    """Mean squared error of the predicted noise."""
-    return torch.mean((eps.float() - noise.float()) ** 2)
-
-
 def x0_loss(
     output: Float[torch.Tensor, "b c h w"],
     z0: Float[torch.Tensor, "b c h w"],

@@ -140,7 +140,7 @@ def step_loss(
             return_dict=False,
         )[0]
     target = consislora.velocity(example.z0, noise, alpha_bar) if example.prediction == "v_prediction" else noise
-    error = consislora.epsilon_loss(predicted, target)
+    error = torch.mean((predicted.float() - target.float()) ** 2)
     if at.step < phase.switch:
         return error, float(error.detach())
     picture = consislora.x0_loss(predicted, example.z0, zt, alpha_bar, example.prediction)

@@ -11,9 +11,12 @@ from mistyle.stylization.diffusion.settings import ModelSettings, TrainSettings
 class TrainJobSettings(FrozenModel):
     """LoRAs from pictures."""
 
-    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
-    threads: int = Field(default=0, ge=0, le=1024, description="threads of torch; 0 takes all cores")
-    word: str = Field(default="", description="the prompt's word for the picture; empty: [c] or [v]")
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    """every random choice follows from it"""
+    threads: int = Field(default=0, ge=0, le=1024)
+    """threads of torch; 0 takes all cores"""
+    word: str = ""
+    """the prompt's word for the picture; empty: [c] or [v]"""
     models: ModelSettings = ModelSettings()
     train: TrainSettings = TrainSettings()
 

@@ -11,17 +11,15 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset
 from mistyle.core.image import overlap
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.render.mitsuba.draw import gbuffer, tracer
+from mistyle.render.mitsuba.draw import tracer, view_of
 from mistyle.render.mitsuba.unlit import unlit
 from mistyle.solver.shape.displace import Displaced, TargetOutline, displace
 from mistyle.solver.shape.settings import DisplaceSettings
-from mistyle.stylization.records import Atlas
 
 CHANGED = 0.5  # of a pixel's coverage
 FEWEST = 6  # pixels of a connected change; fewer are rounding
@@ -96,12 +94,6 @@ def coverages(mesh: Mesh, views: Sequence[View]) -> list[Float[np.ndarray, "h w"
     return [share for _, share in unlit(mesh, grey, [view.camera for view in views])]
 
 
-def moved_atlas(asset: Asset, atlas: Atlas) -> Atlas:
-    """The atlas of the displaced mesh: other surface points, the same texels and materials."""
-    size = atlas.texels[0].covered.shape[0]
-    return Atlas(tuple(rasterise(asset.mesh, part, size) for part in range(len(atlas.texels))), atlas.start)
-
-
 def moved_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], edited: Sequence[str]) -> list[View]:
     """The stylized views on the displaced mesh: geometry traced again, colours drawn from the texture.
 
@@ -110,21 +102,8 @@ def moved_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], edite
     traced, result = tracer(asset.mesh), []
     drawn = unlit(traced, maps, [view.camera for view in views])
     for view, (rgb, share) in zip(views, drawn, strict=True):
-        hits = gbuffer(traced, view.camera)
-        kept = np.zeros(hits.mask.shape, bool)
-        if view.camera.name in edited:
-            kept = view.coverage > CHANGED
+        kept = view.coverage > CHANGED if view.camera.name in edited else np.zeros(share.shape, bool)
         own = view.rgb / np.maximum(view.coverage, 1e-3)[..., None] * share[..., None]
-        result.append(
-            View(
-                camera=view.camera,
-                rgb=np.where(kept[..., None], own, rgb).astype(np.float32),
-                depth=hits.depth,
-                normal=hits.normal,
-                uv=hits.uv,
-                part=hits.part,
-                mask=hits.mask,
-                coverage=share,
-            )
-        )
+        colour = np.where(kept[..., None], own, rgb).astype(np.float32)
+        result.append(view_of(traced, view.camera, np.concatenate([colour, share[..., None]], axis=-1)))
     return result

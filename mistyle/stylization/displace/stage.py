@@ -1,9 +1,10 @@
 """The stage "displace" of a job: the mesh follows the outlines, and everything after it uses the displaced mesh."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import Heights
@@ -12,7 +13,7 @@ from mistyle.io.gltf.displaced import refuse_shared
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.records import load_record
 from mistyle.solver.shape.moved import displaced_asset
-from mistyle.stylization.displace.outlines import Shape, follow_outlines, moved_atlas, moved_views
+from mistyle.stylization.displace.outlines import Shape, follow_outlines, moved_views
 from mistyle.stylization.records import Atlas, Baked
 
 
@@ -58,7 +59,9 @@ def displace_stage(run: Any, asset: Asset, atlas: Atlas, baked: Baked, stylized:
     moved = displaced_asset(asset, shape.result.positions)
     names = [name.rpartition(".")[0] for name in edited]
     views = moved_views(moved, baked.maps, stylized, names)
-    return Reshaped(moved, moved_atlas(moved, atlas), views, asset, shape)
+    size = atlas.texels[0].covered.shape[0]
+    texels = tuple(rasterise(moved.mesh, part, size) for part in range(len(atlas.texels)))
+    return Reshaped(moved, replace(atlas, texels=texels), views, asset, shape)
 
 
 def height_stage(run: Any, asset: Asset, atlas: Atlas) -> Heights | None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.image import dilate, linear_from_srgb, srgb_from_linear
+from mistyle.core.image import dilate, linear_from_srgb, resize, srgb_from_linear
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.stylization.diffusion.settings import ModelSettings, Paint3dSettings
@@ -168,7 +168,7 @@ def paint_atlas(
     size = (side, side) if larger else tuple(-(-n // grain) * grain for n in hole.shape)
     open_part = hole | ~texels.covered
     filled = plan.filled(encoded, hole, texels)
-    mask = plan.shrink_mask(open_part, size)
+    mask = resize(open_part.astype(np.float32), size) > 1e-6  # where any texel of a pixel is open
     painted = inpaint(brush, plan.shrink(filled, size), mask, plan.sampled(where, size), 1.0, rng)
     result = plan.spread_islands(painted, texels, hole, filled)
     if not larger or brush.settings.detail == 0 or min(hole.shape) < side:

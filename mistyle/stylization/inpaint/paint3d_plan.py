@@ -95,13 +95,8 @@ def spread_islands(
         r, c = np.nonzero(target)
         y = (r + rows.start + 0.5) * fr - 0.5 - top
         x = (c + columns.start + 0.5) * fc - 0.5 - left
-        result[box][target] = _bilinear(pure, y, x)
+        result[box][target] = bilinear(pure, np.stack([x, y], axis=1) + 0.5)
     return result
-
-
-def _bilinear(image: Float[np.ndarray, "h w 3"], y: np.ndarray, x: np.ndarray) -> Float[np.ndarray, "n 3"]:
-
-    return bilinear(image, np.stack([x, y], axis=1) + 0.5)
 
 
 def filled(
@@ -118,8 +113,3 @@ def filled(
 def shrink(encoded: Float[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2 3"]:
     """An atlas at the model's size."""
     return np.clip(resize(encoded, size), 0, 1)
-
-
-def shrink_mask(mask: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.ndarray, "h2 w2"]:
-    """A mask at the model's size: true where any texel of a pixel is."""
-    return resize(mask.astype(np.float32), size) > 1e-6

@@ -20,11 +20,6 @@ SIDE = 1024  # BiRefNet's input where the file leaves the size open
 MEAN, SPREAD = np.array([0.485, 0.456, 0.406], np.float32), np.array([0.229, 0.224, 0.225], np.float32)
 
 
-def coverage(view: View) -> Bool[np.ndarray, "h w"]:
-    """The rendered mask: exact for a stylizer that keeps outlines."""
-    return view.mask
-
-
 def segmenter(path: Path) -> Masker:
     """A Masker from an ONNX file with one picture (1 3 s s) in and logits (1 1 s s) out, the last of its outputs.
 

@@ -29,7 +29,7 @@ from mistyle.core.view import Prior, View
 from mistyle.stylization.mvst.lift import Lifted, cosines, depth_tolerance, lift, transformed
 from mistyle.stylization.mvst.settings import WarpSettings
 
-__all__ = ["Lifted", "angle", "composite", "lift", "splat", "warp"]
+__all__ = ["Lifted", "angle", "composite", "lift", "splat"]
 
 EROSION = 20  # the paper's, for `erosion` unset
 EROSION_AT = 1024  # view width to which `erosion` refers
@@ -65,11 +65,6 @@ def _drop_stretched(winner: np.ndarray, known: np.ndarray, view: View, source: L
     normals = np.ascontiguousarray(view.normal.reshape(-1, 3)[pixel].T)
     facing = cosines(view.camera, source.points.take(point, axis=1), normals)
     known.reshape(-1)[pixel] = source.cosine[point] >= settings.sharpness * facing
-
-
-def warp(source: Lifted, view: View, settings: WarpSettings, inside: Bool[np.ndarray, "h w"] | None = None) -> Prior:
-    """One finished view as a prior for another."""
-    return composite([source], view, settings, inside)
 
 
 def composite(

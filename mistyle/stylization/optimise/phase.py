@@ -93,7 +93,8 @@ class PhaseRunner:
         self.struggle = np.zeros(len(table.still), np.float32)
         self.touched = np.zeros(len(table.still), np.float32)
         self.pulled = np.zeros((len(table.still), 3), np.float32)
-        table.forget()
+        # Adam begins anew: each phase has another objective.
+        table.first, table.second, table.steps, table.squares = {}, {}, {}, {}
 
     def step(self, iteration: int) -> str:
         """One step of Adam; on a NaN or infinite value no texel moves, and the returned note names the texel."""
@@ -182,7 +183,7 @@ class PhaseRunner:
         else:
             first, self.beam = self.beam, self.beam + len(surface.cameras)
             alone = [beams[k % len(beams)] for k in range(first, self.beam)]
-            lit, rows = deferred.light_each(self.scene.traced, surface, alone, shadows=False), [[b] for b in alone]
+            lit, rows = deferred.light_rows(self.scene.traced, surface, [alone], None, False), [[b] for b in alone]
         if not beams:
             return lit, None
         towards = [_mean_direction(row, camera) for row, camera in zip(rows, surface.cameras, strict=True)]

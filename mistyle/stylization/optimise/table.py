@@ -16,7 +16,6 @@ from mistyle.core.image import gaussian, nearest, resized_rows
 from mistyle.core.maps import Maps, Texels, rows_of
 from mistyle.process import memory
 
-MAPS = ("albedo", "normal", "roughness", "metallic")
 CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
 TILT_LIMIT = 0.95  # a normal tilted by more than 72 degrees faces away from most views, where its gradient is zero
 ROUGHNESS_FLOOR = 0.05  # below 0.0316 Mitsuba's roughness has no gradient
@@ -55,10 +54,6 @@ class FitTable:
     def parts(self) -> list[slice]:
         """The rows of each set."""
         return rows_of(self.sizes)
-
-    def forget(self) -> None:
-        """Reset Adam's moments: the next phase has another objective."""
-        self.first, self.second, self.steps, self.squares = {}, {}, {}, {}
 
 
 def build(

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.atlas.frames import texel_frames
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.core.image import resize, srgb_from_linear
+from mistyle.core.image import luminance, resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.geometry.tangents import corner_tangents
@@ -121,9 +121,8 @@ def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.nda
     if not any(t.covered.any() for t in texels):
         return None
     near, chosen = nearest_texels(texels)
-    weights = np.array([0.2126, 0.7152, 0.0722], np.float32)
     own = zip(start, chosen, strict=True)
-    light = np.concatenate([srgb_from_linear(m.albedo.reshape(-1, 3)[few] @ weights) for m, few in own])
+    light = np.concatenate([srgb_from_linear(luminance(m.albedo.reshape(-1, 3)[few])) for m, few in own])
     return None if light.std() < PLAIN else lambda where, facing: light[near(where, facing)]
 
 
@@ -238,11 +237,7 @@ def lay_relief(
 
 def protected(maps: Maps, start: Maps, mask: Bool[np.ndarray, "h w"]) -> Maps:
     """The maps with the asset's own values under the mask."""
-    chosen = mask[..., None]
+    masks = {"albedo": mask[..., None], "normal": mask[..., None], "roughness": mask, "metallic": mask}
     return replace(
-        maps,
-        albedo=np.where(chosen, start.albedo, maps.albedo),
-        normal=np.where(chosen, start.normal, maps.normal),
-        roughness=np.where(mask, start.roughness, maps.roughness),
-        metallic=np.where(mask, start.metallic, maps.metallic),
+        maps, **{name: np.where(at, getattr(start, name), getattr(maps, name)) for name, at in masks.items()}
     )

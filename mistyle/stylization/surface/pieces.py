@@ -5,12 +5,12 @@ motifs of the painting: a face, a house, lettering. Coarse levels determine the 
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from mistyle.stylization.surface.exemplar.exemplar import Exemplar
-from mistyle.stylization.surface.field import NearestNeighbourField, pixels
+from mistyle.stylization.surface.field import NearestNeighbourField
 from mistyle.stylization.surface.kernels import BESIDE
 from mistyle.stylization.surface.samples import Level
 
@@ -44,9 +44,3 @@ def on_picture(exemplar: Exemplar, pixel: Int[np.ndarray, " n"]) -> Float[np.nda
     height, width = exemplar.size
     origin = exemplar.origin[pixel]
     return np.stack([origin % width, origin // width], axis=1) / max(height, width)
-
-
-def too_far(level: Level, exemplar: Exemplar, field: NearestNeighbourField, largest: float) -> Bool[np.ndarray, " n"]:
-    """The samples at which a piece is wider than `largest`, a share of the picture's long side."""
-    at = on_picture(exemplar, pixels(exemplar, field))
-    return reach(labels(level, exemplar, field), at) > largest / 2

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
-from mistyle.core.rows import distinct
+from mistyle.core.rows import distinct, unit
 from mistyle.geometry.normals import crease_normals, same_points
 from mistyle.render.mitsuba.device import dr
 from mistyle.stylization.surface import cells, kernels
@@ -58,11 +58,6 @@ class Level:
     neighbours: Int[np.ndarray, "n 25"]
     turned: Bool[np.ndarray, "n 25"]
     offsets: Float[np.ndarray, "n 25 2"]
-
-
-def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Vectors normalised to length one; zero stays zero."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-20)
 
 
 def workers() -> int:
@@ -110,7 +105,8 @@ def spread(
     bary = np.stack([1 - root, root * (1 - v), root * v], axis=1)
     positions = combined(bary, mesh.positions.astype(np.float32), mesh.faces[face])
     normals = unit(combined(bary, corner_normals.astype(np.float32).reshape(-1, 3), 3 * face[:, None] + np.arange(3)))
-    order = in_order(positions)
+    # Along a Z-order curve, equals by index.
+    order = np.sort((morton(positions) << 32) | np.arange(len(positions))) & 0xFFFFFFFF
     positions, normals = positions[order], normals[order]
     radius = SPACING * float(np.sqrt(area / count))
     selected = thin(positions, normals, radius, rng, dj)
@@ -189,11 +185,6 @@ def morton(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
             bits = (bits | (bits << shift)) & mask
         code |= bits << axis
     return code
-
-
-def in_order(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """The points' indices sorted along a Z-order curve, equals by index."""
-    return np.sort((morton(positions) << 32) | np.arange(len(positions))) & 0xFFFFFFFF
 
 
 def nearest(

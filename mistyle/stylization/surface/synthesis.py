@@ -21,7 +21,6 @@ continued pictures (coherent search, Ashikhmin 2001) and a fixed set of offsets 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -46,7 +45,7 @@ from mistyle.stylization.surface.guides.glaze import glaze
 from mistyle.stylization.surface.guides.guides import Content, Guide, Occlusion, level_guides
 from mistyle.stylization.surface.guides.linefield import DirectionConstraint, directions, line_field
 from mistyle.stylization.surface.lookup import CRISP, PaintedSurface, painted_surface
-from mistyle.stylization.surface.pieces import labels, too_far
+from mistyle.stylization.surface.pieces import labels, on_picture, reach
 from mistyle.stylization.surface.samples import Level, nearest, sample_normals, spread, with_tables
 from mistyle.stylization.surface.settings import PlainSettings, ResolvedSettings, SurfaceSettings
 
@@ -269,7 +268,10 @@ def paint_level(
     field = on_device(dj, start)
     complete = min(task.rounds, int(ALL_PAIRS // (len(descriptors) * len(described))))
     for turn in range(task.rounds):
-        colour = constrained(kernels.vote(dj, table, arrays, field), task.constraints, dj)
+        colour = kernels.vote(dj, table, arrays, field)
+        if task.constraints is not None:
+            known, own = task.constraints.known[:, None], task.constraints.colour
+            colour = kernels.floats(dj, np.where(known, own, colour.numpy().reshape(-1, 3)))
         descriptors[:, : kernels.PATCH] = (
             kernels.describe(dj, table, colour, axes, mean).numpy().reshape(-1, kernels.PATCH)
         )
@@ -288,19 +290,13 @@ def paint_level(
     return on_host(field)
 
 
-def constrained(colour: Any, constraints: ColourConstraints | None, dj: ModuleType) -> Any:
-    """Voted colours, flat (n 3), replaced by known ones."""
-    if constraints is None:
-        return colour
-    known, own = constraints.known[:, None], constraints.colour
-    return kernels.floats(dj, np.where(known, own, colour.numpy().reshape(-1, 3)))
-
-
 def patch_size_limit(
     level: Level, exemplar: style.Exemplar, field: NearestNeighbourField, largest: float, dj: ModuleType
 ) -> kernels.PatchSizeLimit:
-    """The samples whose piece neighbours may not extend, because it has the largest size."""
-    far = too_far(level, exemplar, field, largest)
+    """The samples whose piece neighbours may not extend, because it has the largest size, a share of the picture's
+    long side."""
+    at = on_picture(exemplar, pixels(exemplar, field))
+    far = reach(labels(level, exemplar, field), at) > largest / 2
     height, width = exemplar.size
     around = max(largest * max(height, width), LEAST_AROUND)
     return kernels.PatchSizeLimit(kernels.floats(dj, far.astype(np.float32)), kernels.floats(dj, np.array([around])))
@@ -335,16 +331,11 @@ def described_guide(
     out[:, 19] = guide.directed * guide_scale[3]
     out[:, 21] = guide.detail * np.float32(settings.relief * exemplar.band.std())
     out[:, kernels.CLOSED] = 1 - LOOSE * np.minimum(np.abs(guide.detail) / -CREASE, 1)
-    weight = urgency(guide.detail)
+    weight = np.minimum(np.abs(guide.detail), 1.5) ** 1.5  # urgency, 0..1.84
     # A scan that is bumpy everywhere would constrain all strokes: the weight falls with the mean urgency.
     load = max(float(weight.mean()), 1e-6)
     weight = weight * (settings.detail * np.clip(np.sqrt(TYPICAL_LOAD / load), 0.6, 1.6))
     return out, weight.astype(np.float32)
-
-
-def urgency(detail: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Weight 0..1.84 of a detail guide by its magnitude."""
-    return np.minimum(np.abs(detail), 1.5) ** 1.5
 
 
 def exhaustive(

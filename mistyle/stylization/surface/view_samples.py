@@ -52,7 +52,9 @@ def paint_view(view: View, prior: Prior | None, base: MeshGuides, seed: int) -> 
     """
     dj = kernels.module()
     result = np.zeros(view.rgb.shape, np.float32)
-    active = view.mask if prior is None else beside_unknown(view, prior, MARGIN * finest_side(view, base))
+    active = view.mask
+    if prior is not None:
+        active = view.mask & (distance_to(view.mask & ~prior.known) <= MARGIN * finest_side(view, base))
     if not active.any():
         return result if prior is None else joined(result, prior, view.mask)
     views = view_levels(view, active, base)
@@ -66,11 +68,6 @@ def paint_view(view: View, prior: Prior | None, base: MeshGuides, seed: int) -> 
     normals = np.broadcast_to(TOWARDS, positions.shape)
     result.reshape(-1, 3)[pixels] = lookup.colour(surface, positions, normals, footprint=1.0)
     return result if prior is None else joined(result, prior, view.mask)
-
-
-def beside_unknown(view: View, prior: Prior, margin: int) -> Bool[np.ndarray, "h w"]:
-    """The foreground unknown to the prior, dilated by `margin` pixels."""
-    return view.mask & (distance_to(view.mask & ~prior.known) <= margin)
 
 
 def footprint(view: View) -> float:
@@ -121,7 +118,7 @@ def view_level(view: View, active: Bool[np.ndarray, "h w"], side: int, level: Le
         level.points.spacing,
         None,
     )
-    tangent, length = on_screen(view, px, depth, drop(level.points, level.tangent, at))
+    tangent, length = on_screen(view, px, drop(level.points, level.tangent, at))
     directed = drop(level.points, guide.directed, at) * length
     own = Guide(carry(level.points, guide.colour, at), carry(level.points, guide.detail, at), directed)
     points = as_points(flat_positions(view, pixel), np.broadcast_to(TOWARDS, (len(pixel), 3)), float(side))
@@ -148,7 +145,7 @@ def representatives(
 
 
 def on_screen(
-    view: View, px: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"], tangent: Float[np.ndarray, "n 3"]
+    view: View, px: Float[np.ndarray, "n 2"], tangent: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Tangents projected into the picture, unit, z = 0, and their projected length (1: not foreshortened)."""
     cam = tangent @ view.camera.cam_from_world[:3, :3].T

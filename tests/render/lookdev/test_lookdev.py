@@ -138,7 +138,7 @@ def test_light_and_camera_stand_still_while_the_asset_turns(tmp_path):
     stage = sheet.Stage(read_mesh(path))
     light = sheet.rigs(None, read=lambda p: np.ones((8, 16, 3), np.float32))[1].light
     first, turned = (stage.picture(a, 10, light, 48, 64)[..., :3] for a in (0, 90))
-    (_, opposite) = stage.light_turn(2, light, 48, 64, 0, lambda done: None)
+    (_, opposite) = stage.turn(2, light, 48, 64, 0, lambda done: None, of_light=True)
     here, other = np.abs(turned - first).mean(), np.abs(opposite[..., :3] - first).mean()
     assert here < 0.2 * other, (here, other)
     # The hard key comes from the upper left.

@@ -12,7 +12,7 @@ from mistyle.render.deferred import bsdf
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.mitsuba import device, draw, plugins
 from mistyle.render.mitsuba import scene as scenery
-from tests.render.deferred.test_bsdf import albedo_of, cases, loaded
+from tests.render.deferred.test_bsdf import albedo_of, cases, evaluate, loaded
 from tests.render.deferred.test_seam import KEY, Path, crop, random_maps, tables, torus
 from tests.support.helpers import from_front
 
@@ -178,7 +178,7 @@ def test_mikkt_frame_equals_the_deferred_sum(rng, model):
 
 
 def shaded(mesh, maps, camera, tangents):
-    """`bsdf.evaluate` of the traced surface under KEY, by the deferred trace and the textures' bilinear taps."""
+    """`evaluate` of the traced surface under KEY, by the deferred trace and the textures' bilinear taps."""
     import mitsuba as mi
 
     ours = Path(mesh, [camera], (KEY,), [SIZE], tangents)
@@ -189,7 +189,7 @@ def shaded(mesh, maps, camera, tangents):
     )
     rest = (mi.Float(fetched[name].ravel()) for name in ("roughness", "metallic"))
     ((wo, irradiance),) = ours.lit.directional
-    value = bsdf.evaluate(bsdf.Reflectance("gltf"), ours.lit.wi, wo, normal, albedo, *rest) * irradiance
+    value = evaluate(bsdf.Reflectance("gltf"), ours.lit.wi, wo, normal, albedo, *rest) * irradiance
     return np.array(value).T.reshape(*ours.lit.size, 3)
 
 

@@ -45,7 +45,6 @@ def test_a_bright_thing_is_found(runtime, tmp_path):
     found = masks.segmenter(tmp_path / "net.onnx")(view)
     assert runtime.seen.shape == (1, 3, 64, 64) and runtime.seen.dtype == np.float32
     assert overlap(found, view.mask) > 0.97
-    assert np.array_equal(masks.coverage(view), view.mask)
     middle = srgb_from_linear(view.rgb)[64, 64]
     assert runtime.seen[0, :, 32, 32] == pytest.approx((middle - masks.MEAN) / masks.SPREAD, abs=1e-5)
 

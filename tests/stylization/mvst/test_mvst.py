@@ -36,12 +36,12 @@ class Noise:
 def disagreement(views: list[View]) -> float:
     """Mean difference between a view and its neighbour carried into it."""
     from mistyle.stylization.mvst.settings import WarpSettings
-    from mistyle.stylization.mvst.warp import lift, warp
+    from mistyle.stylization.mvst.warp import composite, lift
 
     plain = WarpSettings(erosion=0, fill=0)
     errors = []
     for a, b in zip(views, [*views[1:], views[0]], strict=True):
-        prior = warp(lift(a, plain), b, plain)
+        prior = composite([lift(a, plain)], b, plain)
         errors.append(np.abs(prior.rgb - b.rgb)[prior.known & erode(b.mask, 2)].mean())
     return float(np.mean(errors))
 

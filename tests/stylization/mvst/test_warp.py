@@ -11,10 +11,15 @@ from mistyle.core.view import View
 from mistyle.stylization.mvst import warp as warp_module
 from mistyle.stylization.mvst.lift import depth_tolerance, discontinuities
 from mistyle.stylization.mvst.settings import WarpSettings
-from mistyle.stylization.mvst.warp import angle, composite, lift, splat, warp
+from mistyle.stylization.mvst.warp import angle, composite, lift, splat
 
 BALL = (0.0, 0.0, 0.0, 0.9)
 BARE = WarpSettings(fill=0, erosion=0, facing=0.0, sharpness=0.0, look_up=False)  # the scatter alone
+
+
+def warp(source, view, settings):
+    """One finished view as a prior for another."""
+    return composite([source], view, settings)
 
 
 def colours(points: np.ndarray) -> np.ndarray:

@@ -22,6 +22,8 @@ from mistyle.stylization.optimise.settings import FitSettings
 from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, shrinkage, two_phase
 from tests.render.deferred.test_seam import sphere
 
+MAPS = ("albedo", "normal", "roughness", "metallic")
+
 SIZE, RESOLUTION = 128, 112
 QUICK = FitSettings(
     iterations1=40, iterations2=40, crops=2, crop_size=64, crop_scale=(0.75, 1.2), radius=6.0, judge=False, refine="all"
@@ -162,7 +164,7 @@ def test_same_seed_same_bytes(scene):
     mesh, maps, texels, views = scene
     settings = QUICK.model_copy(update={"iterations1": 3, "iterations2": 3})
     made = [two_phase(mesh, FitStart([maps]), FitTargets(views), [texels], settings, seed) for seed in (1, 1, 2)]
-    bytes_of = [b"".join(getattr(fit.maps[0], n).tobytes() for n in fit_table.MAPS) for fit in made]
+    bytes_of = [b"".join(getattr(fit.maps[0], n).tobytes() for n in MAPS) for fit in made]
     assert bytes_of[0] == bytes_of[1] != bytes_of[2]
     assert made[0].trace == made[1].trace
     assert made[0].struggle[0].tobytes() == made[1].struggle[0].tobytes()
@@ -190,7 +192,7 @@ def test_pixels_of_a_target_that_are_no_number_are_left_out(scene):
     poisoned = [*views[:3], replace(views[3], rgb=rgb), *views[4:]]
     settings = QUICK.model_copy(update={"iterations1": 8, "iterations2": 8, "judge": True})
     fit = two_phase(mesh, FitStart([maps]), FitTargets(poisoned), [texels], settings, 0)
-    assert all(np.isfinite(getattr(fit.maps[0], name)).all() for name in fit_table.MAPS)
+    assert all(np.isfinite(getattr(fit.maps[0], name)).all() for name in MAPS)
     assert all(np.isfinite(fit.figures[name]).all() for name in fit.figures)
 
 
@@ -321,7 +323,7 @@ def test_the_table_averages_covered_texels_and_gives_back_what_it_was_given(rng)
     block = maps.albedo[4:6, 4:6].reshape(4, 3)[1:]  # without the uncovered texel
     np.testing.assert_allclose(table.values["albedo"].reshape(8, 8, 3)[2, 2], block.mean(axis=0), rtol=1e-5)
     same = fit_table.finished(table, [maps])[0]
-    assert all(np.array_equal(getattr(same, name), getattr(maps, name)) for name in fit_table.MAPS)
+    assert all(np.array_equal(getattr(same, name), getattr(maps, name)) for name in MAPS)
     # The islands' common border, between columns 3 and 4 of the table, joins nothing.
     assert not table.right.reshape(8, 8)[:, 3].any() and table.right.reshape(8, 8)[:, [0, 4]].all()
     table.values["albedo"] += 0.1

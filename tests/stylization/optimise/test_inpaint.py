@@ -1,4 +1,4 @@
-"""The struggle mask, the blend and the weight-free fill, against values worked out by hand."""
+"""The struggle mask, the blend and the repair, against values worked out by hand."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from mistyle.core.maps import Maps, Texels, flat_maps
-from mistyle.stylization.inpaint.fill import _harmonic, grow, inpainter
+from mistyle.stylization.inpaint.fill import from_paint
 from mistyle.stylization.inpaint.repair import blend_weights, radius, repair, struggle_mask
 from mistyle.stylization.inpaint.settings import RepairSettings
 
@@ -179,94 +179,14 @@ def test_texels_outside_the_dilated_mask_keep_their_bits(seed):
 
 def test_an_empty_mask_changes_nothing(rng):
     maps = random_maps(rng, 16)
-    assert repair(maps, np.zeros((16, 16), bool), one_island(16), inpainter(), RepairSettings()) is maps
+    paint = from_paint(np.zeros((16, 16, 3), np.float32))
+    assert repair(maps, np.zeros((16, 16), bool), one_island(16), paint, RepairSettings()) is maps
 
 
 @pytest.mark.parametrize("answer", [np.zeros((8, 8, 3), np.float32), np.full((16, 16, 3), np.nan, np.float32)])
 def test_a_useless_inpainter_is_refused(rng, answer):
     with pytest.raises(ValueError, match="inpainter"):
         repair(random_maps(rng, 16), disk(16, 8, 8, 4), one_island(16), lambda *_: answer, RepairSettings())
-
-
-def test_the_surface_solution_is_asked_first(rng):
-    texels, hole = one_island(64), disk(64, 30, 30, 9)
-
-    def colours(positions, normals):
-        assert positions.shape == normals.shape == (hole.sum(), 3)
-        answer = positions / 100
-        answer[positions[:, 0] > 34] = np.nan  # no answer there
-        return answer
-
-    albedo = np.full((64, 64, 3), 0.5, np.float32)
-    painted = inpainter(colours)(albedo, hole, texels, rng)
-    asked = hole & (np.arange(64)[:, None] <= 34)
-    assert np.abs(painted[asked] - texels.position[asked] / 100).max() < 1e-6
-    assert np.array_equal(painted[~hole], albedo[~hole])
-    # The rest grows from between the answers (0.34 in red) and the untouched 0.5.
-    assert np.isfinite(painted).all() and abs(painted[hole & ~asked][:, 0].mean() - 0.42) < 0.08
-
-
-def test_a_linear_gradient_grows_on_through_a_hole():
-    # Linear functions solve Laplace's equation; the blur leaves them alone except within 3 sigma of a border.
-    rows, columns = np.indices((128, 128)) / 128
-    albedo = np.stack([0.2 + 0.6 * columns, 0.8 - 0.5 * rows, 0.3 + 0.2 * rows + 0.2 * columns], axis=-1).astype(
-        np.float32
-    )
-    hole = disk(128, 64, 60, 22)
-    painted = grow(np.where(hole[..., None], 9, albedo).astype(np.float32), hole, one_island(128))
-    assert np.abs(painted - albedo)[hole].max() < 0.05 and np.abs(painted - albedo)[hole].mean() < 0.01
-    assert painted[~hole].tobytes() == albedo[~hole].tobytes()
-
-
-def test_the_smooth_part_solves_laplace_s_equation():
-    # Three harmonic functions (real parts of analytic ones); only their values around the hole are given.
-    y, x = (np.indices((96, 96)) - 48) / 96
-    functions = [x * x - y * y, 2 * (3 * x * x * y - y**3), np.exp(2 * x) * np.sin(2 * y) / 4]
-    exact = np.stack(functions, axis=-1).astype(np.float32)
-    hole = np.hypot(x, y + 0.05) < 0.33
-    found = _harmonic(np.where(hole[..., None], 0, exact).astype(np.float32), ~hole, np.ones_like(hole))
-    # A mean between the rim's values alone (the pyramid without sweeps) errs three times as much.
-    assert np.abs(found - exact).max() < 0.015 and np.abs(found - exact)[hole].mean() < 0.005
-
-
-def test_detail_goes_on_into_the_hole(rng):
-    albedo = np.clip(0.5 + 0.15 * rng.normal(size=(128, 128, 1)) * np.ones(3), 0, 1).astype(np.float32)
-    hole = disk(128, 64, 64, 16)
-    painted = grow(albedo, hole, one_island(128))
-    assert 0.6 < painted[hole].std() / albedo[~hole].std() < 1.4
-    # And it joins the rim: no more of a step there than anywhere.
-    rim = hole & ~ndimage.binary_erosion(hole)
-    assert np.abs(painted[rim].mean(axis=0) - 0.5).max() < 0.06
-
-
-def test_no_colour_crosses_between_islands():
-    # Cut along the diagonal, so that the rectangle around either island holds the other one too.
-    rows, columns = np.indices((128, 128))
-    texels = texels_of(np.where(rows > columns + 1, 0, np.where(rows < columns - 1, 1, -1)))
-    albedo = np.where((texels.island == 0)[..., None], np.float32([1, 0, 0]), np.float32([0, 0, 1]))
-    hole = disk(128, 60, 63, 30) & texels.covered
-    painted = grow(np.where(hole[..., None], 0.5, albedo).astype(np.float32), hole, texels)
-    assert np.abs(painted - albedo)[texels.covered].max() < 1e-5
-
-
-def test_an_island_that_is_all_hole_takes_the_nearest_colour_in_space():
-    island = np.repeat([[0, 1, 2]], 4, axis=0).repeat(8, axis=1)
-    position = np.zeros((4, 24, 3))
-    position[..., 0] = np.repeat([0.0, 5.0, 4.5], 8)
-    albedo = (island[..., None] / 4 + 0.25).repeat(3, axis=-1).astype(np.float32)
-    painted = grow(albedo, island == 1, texels_of(island, position))
-    assert (painted[:, 8:16] == 0.75).all()
-    everything = island >= 0
-    assert np.array_equal(grow(albedo, everything, texels_of(island, position)), albedo)
-
-
-def test_growing_is_deterministic_and_ignores_what_lies_under_the_hole(rng):
-    texels, hole = two_islands(64), disk(64, 30, 20, 12)
-    albedo = rng.random((64, 64, 3)).astype(np.float32)
-    other = np.where(hole[..., None], 1 - albedo, albedo).astype(np.float32)
-    first, second = grow(albedo, hole, texels), grow(other, hole, texels)
-    assert first[hole & texels.covered].tobytes() == second[hole & texels.covered].tobytes()
-    assert (first >= 0).all() and (first <= 1).all()
 
 
 def test_of_views_that_agree_nothing_stands_out():

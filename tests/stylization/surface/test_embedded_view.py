@@ -121,7 +121,7 @@ def test_tangents_on_screen_are_those_that_are_seen(rng):
     points = world_from_px(view.camera, px, depth.astype(float))
     direction = rng.normal(size=(len(pixel), 3))
     seen = px_from_world(view.camera, points + 1e-5 * direction)[0] - px
-    flat, _ = view_samples.on_screen(view, px, depth, direction.astype(np.float32))
+    flat, _ = view_samples.on_screen(view, px, direction.astype(np.float32))
     assert np.abs(flat[:, :2] - seen / np.linalg.norm(seen, axis=1, keepdims=True)).max() < 2e-3
     assert not flat[:, 2].any()
 

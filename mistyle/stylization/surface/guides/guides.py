@@ -70,7 +70,10 @@ def level_guides(
     if content is not None and settings.keep_content > 0:
         lightness = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
         content_share = settings.keep_content * min(float(lightness[-1].std()) / LEAST_CONTENT, 1.0)
-        tone, details = with_content(levels, tone, details, lightness, content_share)
+        # The texture keeps its contrast; its lightness is shifted to the tone's mean.
+        own = [each + np.float32(tone[-1].mean() - lightness[-1].mean()) for each in lightness]
+        details = mixed(details, detail(levels, own, [0 * each for each in own]), content_share)
+        tone = mixed(tone, own, content_share)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
     colour = colour_field(tone[middle], fields, shown, palette, rng)
     typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, content_share)
@@ -129,22 +132,6 @@ def tones(
         tone.append((bake_light * key + (1 - bake_light) * top).astype(np.float32))
         cavity.append(level_hollow.astype(np.float32))
     return tone, cavity
-
-
-def with_content(
-    levels: Sequence[Level],
-    tone: Sequence[Float[np.ndarray, " _"]],
-    details: Sequence[Float[np.ndarray, " _"]],
-    content: Sequence[Float[np.ndarray, " _"]],
-    share: float,
-) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
-    """Tone and details blended with the lightness of the asset's own texture, at its contrast.
-
-    The texture's lightness is shifted to the tone's mean.
-    """
-    shift = np.float32(tone[-1].mean() - content[-1].mean())
-    own = [lightness + shift for lightness in content]
-    return mixed(tone, own, share), mixed(details, detail(levels, own, [0 * c for c in own]), share)
 
 
 def detail(
