@@ -22,6 +22,8 @@ UpAxis = Literal["y", "z", "-y", "-z"]  # of a file, that points up
 TURNED = " up to Y up"  # part of the note of every mesh that reading has turned
 # Rows and columns as the file stores them, or as a viewer shows the picture (EXIF orientation).
 Pixels = Literal["stored", "upright"]
+# In a reader's note: pictures of the file show the feature that the note is about, and other renders do not.
+SHOWN = "shows in lookdev and compare"
 # Endings of cameras' RAW files.
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
@@ -165,3 +167,7 @@ class Asset:
     mesh: Mesh
     materials: tuple[Material, ...]
     source: Source
+
+    def notes_of_pictures(self) -> tuple[str, ...]:
+        """The reader's notes without those on features that pictures of the file show."""
+        return tuple(note for note in self.source.notes if SHOWN not in note)

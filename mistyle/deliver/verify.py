@@ -156,15 +156,15 @@ def _rendered(
     if blender is None:
         checks.append(Check(name, check, "not checked", f"Blender not found (name it with --blender or {BLENDER})"))
         return
-    from mistyle.render.external.renderers import left_out, renderer, shots, subject
+    from mistyle.render.external.renderers import features, renderer, shots, subject
 
     both = [renderer("blender:cycles", blender), renderer("mitsuba:path")]
     with TemporaryDirectory(prefix="mistyle-") as work:
         try:
             scene = subject(models[0], Path(work), both, rendering.threads)
-            missing = left_out(scene)
-            if missing:
-                checks.append(Check(name, check, "not checked", f"{', '.join(missing)}: not drawn by Mitsuba"))
+            unlike = features(scene)
+            if unlike:
+                checks.append(Check(name, check, "not checked", f"{', '.join(unlike)}: left out of this check"))
                 return
             for k, shot in enumerate(shots(scene, [rendering.light], rendering.views, rendering.size)):
                 pair = [r.draw(scene, shot, rendering.spp, [1 + 1000 * k + 100 * j]) for j, r in enumerate(both)]

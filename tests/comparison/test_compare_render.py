@@ -14,7 +14,7 @@ from mistyle.core.paths import scenes
 from mistyle.io.read import read_exr, read_radiance
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.external.render_files import Subject, write_asset_glb
-from mistyle.render.external.renderers import left_out, renderer, shots, subject
+from mistyle.render.external.renderers import features, left_out, renderer, shots, subject
 from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.mitsuba.draw import gbuffer
 from tests.support.helpers import data
@@ -145,7 +145,8 @@ def test_an_asset_of_ours_is_a_run_folder(demo, tmp_path):
     found = subject(tmp_path, tmp_path / "work", [])
     assert found.path.name == "chair.glb" and left_out(found) == []
     helmet = data("meshes/pbr/DamagedHelmet/DamagedHelmet.glb")
-    assert "emission" in left_out(Subject(helmet, tmp_path))
+    assert features(Subject(helmet, tmp_path)) == ["emission"] and left_out(Subject(helmet, tmp_path)) == []
+    assert left_out(Subject(helmet, tmp_path, export=True)) == ["emission"]
 
 
 def test_a_scene_file_is_not_for_cycles(corner, tmp_path):

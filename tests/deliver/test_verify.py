@@ -287,7 +287,7 @@ def test_blender_is_asked_as_the_program_or_as_a_python(run, monkeypatch, tmp_pa
     assert outcomes(gone, "ball.glb", "Blender") == {"failed"}
 
 
-def test_what_mitsuba_does_not_draw_is_not_compared(tmp_path, run):
+def test_assets_with_emission_or_alpha_are_not_compared_with_cycles(tmp_path, run):
     from tests.support.gltf_cases import strange_gltf
 
     path = strange_gltf(tmp_path / "strange.glb")

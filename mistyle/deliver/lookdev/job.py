@@ -97,7 +97,7 @@ def lookdev(
     with progress.stage("read", "read the asset"):
         subject = read_subject(place)
         sky = None if hdri is None else read_radiance(hdri)
-    progress.note(*subject.asset.source.notes)
+    progress.note(*subject.asset.notes_of_pictures())
     with progress.stage("light", "expose the lights"):
         name = "" if hdri is None else hdri.stem
         lights = [drawing.exposed(rig, settings.seed) for rig in drawing.rigs(sky, name, read_radiance)]
@@ -275,7 +275,7 @@ def shown(picture: np.ndarray) -> np.ndarray:
 
 
 def facts(subject: SheetSubject) -> tuple[str, ...]:
-    """The asset in one line, and the first two notes of its reader."""
+    """The asset in one line, and the first two notes of its reader that hold for the sheet."""
     mesh, sizes = subject.asset.mesh, []
     for material in subject.asset.materials:
         if material.albedo is not None:
@@ -283,7 +283,7 @@ def facts(subject: SheetSubject) -> tuple[str, ...]:
     textures = ", ".join(sorted(set(sizes))) or "no textures"
     sets = f"{len(mesh.parts)} texture set{'s' if len(mesh.parts) > 1 else ''}"
     line = f"{len(mesh.faces):,} faces   ·   {sets}   ·   {textures}"
-    return (line, *subject.asset.source.notes[:2])
+    return (line, *subject.asset.notes_of_pictures()[:2])
 
 
 def burn_in(subject: SheetSubject, settings: LookSettings, day: str) -> str:

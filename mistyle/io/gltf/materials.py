@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.core.asset import Shading
+from mistyle.core.asset import SHOWN, Shading
 from mistyle.io.gltf.check import data_uri
 from mistyle.io.gltf.glb import Buffers
 from mistyle.io.gltf.infos import (
@@ -28,8 +28,8 @@ from mistyle.io.meshes.parsed_mesh import Maps, RawMap, RawMaterial, no_textures
 from mistyle.io.sandbox.bounds import beside, read_bytes
 
 Tree = dict[str, Any]
-_READ = ("KHR_materials_unlit", "KHR_materials_emissive_strength", GLOSSY)
-_DRAWN = ("KHR_materials_ior", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_transmission")
+READ = ("KHR_materials_unlit", "KHR_materials_emissive_strength", GLOSSY)
+DRAWN = ("KHR_materials_ior", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_transmission")
 
 
 def read_material(
@@ -128,8 +128,8 @@ def _unseen(tree: Tree, index: int) -> list[str]:
         )
     elif emits(entry):
         notes.append(
-            f"Material '{name}' emits light, which painted views omit; it stays in the GLB and is added "
-            "to the painting."
+            f"Material '{name}' emits light, which {SHOWN}; views and paintings omit it. It stays in the GLB and is "
+            "added to the painting."
         )
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         notes.append(f"Material '{name}' is unlit: without --lit, viewers of a result show its albedo alone.")
@@ -141,15 +141,21 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
     entry, notes = tree["materials"][index], []
     if sees_through(tree, index):
         mode = "cut out" if entry["alphaMode"] == "MASK" else "blended"
-        notes.append(f"Material '{name}' is {mode} by its alpha, which stays in the GLB; painted views show it opaque.")
-    more = sorted(n for n in entry.get("extensions", {}) if n.startswith("KHR_materials_") and n not in _READ)
-    drawn = [n for n in more if n in _DRAWN]
+        notes.append(
+            f"Material '{name}' is {mode} by its alpha, which stays in the GLB and {SHOWN}; views, paintings and fits "
+            "take it as opaque."
+        )
+    more = sorted(n for n in entry.get("extensions", {}) if n.startswith("KHR_materials_") and n not in READ)
+    drawn = [n for n in more if n in DRAWN]
     if drawn:
-        notes.append(f"Material '{name}' has {', '.join(drawn)}, which stays in the GLB; painted views omit it.")
+        notes.append(
+            f"Material '{name}' has {', '.join(drawn)}, which stays in the GLB and {SHOWN}; views, paintings and fits "
+            "omit it."
+        )
     with_maps = [n for n in drawn if any(k.endswith("Texture") for k in extension(entry["extensions"], n))]
     if any(n != "KHR_materials_specular" for n in with_maps):
         notes.append(f"Material '{name}': the factors of {' and '.join(with_maps)} were read, not the textures.")
-    more = [n for n in more if n not in _DRAWN]
+    more = [n for n in more if n not in DRAWN]
     if more:
         notes.append(f"Material '{name}' has {', '.join(more)}, which stays in the GLB; renders here leave it out.")
     if GLOSSY in entry.get("extensions", {}):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from mistyle.core.asset import Shading
+from mistyle.core.asset import SHOWN, Shading
 from mistyle.core.paths import real_path
 from mistyle.geometry.retexture import REPEAT
 from mistyle.io.images.quantisation import Kind, fractions, linear_rows
@@ -135,7 +135,7 @@ def unread(entries: Sequence[MtlEntry]) -> list[str]:
         drawn += ["emission"] * (any(shading.emission) or "map_ke" in textures)
         if drawn:
             notes.append(
-                f"The {' and '.join(drawn)} of material '{entry.name}' shows in lookdev and compare; "
+                f"The {' and '.join(drawn)} of material '{entry.name}' {SHOWN}; "
                 "views, paintings and finished assets omit it."
             )
         if {"d", "tr"} <= set(entry.values):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.asset import Shading
+from mistyle.core.asset import SHOWN, Shading
 from mistyle.core.errors import InputRefused
 from mistyle.geometry.retexture import Wrap
 from mistyle.io.images.read import MAX_PICTURE_BYTES, Budget, alpha_map, decode
@@ -137,8 +137,7 @@ def read_material(
     unpainted = [n for n in UNPAINTED if _differs(_source(pxr, surface.GetInput(n), time), UNPAINTED[n])]
     if unpainted:
         notes.append(
-            f"The {' and '.join(unpainted)} of material '{name}' shows in lookdev and compare; "
-            "views, paintings and finished assets omit it."
+            f"The {' and '.join(unpainted)} of material '{name}' {SHOWN}; views, paintings and finished assets omit it."
         )
     if _source(pxr, surface.GetInput("useSpecularWorkflow"), time):
         notes.append(f"Material '{name}' has the specular workflow: it is drawn so, and painted as not metallic.")

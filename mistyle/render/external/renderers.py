@@ -124,19 +124,36 @@ def finished_asset(folder: Path) -> Path:
 
 
 def left_out(source: Subject) -> list[str]:
-    """glTF features that Mitsuba's side does not render: emission, transparency, material extensions."""
-    if source.path.suffix.lower() not in (".glb", ".gltf"):
-        return []
-    from mistyle.io.read_mesh import load_gltf
+    """glTF features that Mitsuba's side does not render: all `features` of a scene exported for other versions, else
+    the material extensions, or their textures, that the reader leaves out."""
+    from mistyle.io.gltf.materials import DRAWN, READ
 
+    if source.export:
+        return features(source)
+    names = {n for n in features(source) if n.startswith("KHR_") and n not in (*READ, *DRAWN)}
+    for material in _gltf_materials(source):
+        for n in set(material.get("extensions", {})) & set(DRAWN) - {"KHR_materials_specular"}:
+            names |= {f"textures of {n}" for key in material["extensions"][n] if key.endswith("Texture")}
+    return sorted(names)
+
+
+def features(source: Subject) -> list[str]:
+    """The glTF features of a file besides its maps: emission, transparency, material extensions."""
     names: set[str] = set()
-    for material in load_gltf(source.path)[0].get("materials", []):
+    for material in _gltf_materials(source):
         if any(material.get("emissiveFactor", [0, 0, 0])):
             names.add("emission")
         if material.get("alphaMode", "OPAQUE") != "OPAQUE":
             names.add("transparency")
         names |= {n for n in material.get("extensions", {}) if n.startswith("KHR_materials_")}
     return sorted(names)
+
+
+def _gltf_materials(source: Subject) -> list[dict[str, Any]]:
+    from mistyle.io.read_mesh import load_gltf
+
+    is_gltf = source.path.suffix.lower() in (".glb", ".gltf")
+    return load_gltf(source.path)[0].get("materials", []) if is_gltf else []
 
 
 def shots(source: Subject, lights: Sequence[str], views: int, size: int) -> list[RenderView]:

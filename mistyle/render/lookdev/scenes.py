@@ -91,7 +91,7 @@ def asset_scene(shapes: dict[str, Any], camera: Camera, lights: Sequence[Light],
     """A loaded `mi.Scene` whose environment lights the asset but is invisible. `integrator` is "path" or "direct"."""
     device.use()
     own = integrator in OWN and appearance.needs_path(shapes)
-    chosen = appearance.integrator(OWN[integrator]) if own else integrator_dict(integrator)
+    chosen = appearance.integrator(OWN[integrator], shapes) if own else integrator_dict(integrator)
     described: dict[str, Any] = {"type": "scene", "integrator": chosen}
     described["sensor"] = sensor_dict(camera, 64)
     for k, emitter in enumerate(emitters(lights, camera)):

@@ -7,7 +7,7 @@ Four Python plugins for Mitsuba; plain materials do not need them (`object_shape
 - an emitter `Glow`: radiance of a mesh to either side, times its opacity. Light paths find it by BSDF sampling, not by
   emitter sampling: directly visible emission has no noise, and no sample of the environment is lost to it;
 - an integrator `Path`: Mitsuba's `path` with hidden emitters, but it hides only the environment, and surfaces that a
-  path passes through do not count as bounces.
+  path passes through do not count as bounces. Where the asset has opacity, shadow rays pass through it as in `volpath`.
 """
 
 from dataclasses import replace
@@ -25,7 +25,7 @@ from mistyle.render.mitsuba import device, plugins
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.device import dr, mi
 
-PASSED = 32  # most surfaces that a path passes through
+PASSED = 32  # most surfaces that a path passes through, and most that one of its shadow rays passes through
 LABELS = ("sampler", "ray", "active", "depth", "passed", "result", "throughput", "before", "pdf", "delta", "valid")
 LEAST_INDEX = 1.001  # Mitsuba rejects a solid with the index of air
 ROUNDING = 1e-4  # of an interpolated opacity: one equal to its cutoff is opaque
@@ -79,13 +79,21 @@ def shapes(asset: Asset, maps: list[OwnMaps]) -> dict[str, Any]:
 
 def needs_path(shapes: dict[str, Any]) -> bool:
     """Whether a shape emits or transmits light, which Mitsuba's own integrators would not render correctly."""
-    loaded = [s for s in shapes.values() if isinstance(s, mi.Shape)]
-    return any(s.is_emitter() or mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in loaded)
+    return _has_alpha(shapes) or any(s.is_emitter() for s in _loaded_shapes(shapes))
 
 
-def integrator(depth: int) -> Any:
-    """A `Path` of at most `depth` vertices, the light's included."""
-    return classes(mi.variant())["Path"](depth)
+def integrator(depth: int, shapes: dict[str, Any]) -> Any:
+    """A `Path` of at most `depth` vertices, the light's included. Shadow rays pass through surfaces if `shapes` have
+    alpha."""
+    return classes(mi.variant())["Path"](depth, _has_alpha(shapes))
+
+
+def _has_alpha(shapes: dict[str, Any]) -> bool:
+    return any(mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in _loaded_shapes(shapes))
+
+
+def _loaded_shapes(shapes: dict[str, Any]) -> list[Any]:
+    return [s for s in shapes.values() if isinstance(s, mi.Shape)]
 
 
 def _surface_bsdf(material: Material, maps: OwnMaps, plugin_types: dict[str, type]) -> dict[str, Any]:
@@ -213,9 +221,9 @@ def _glow_class() -> type:
 
 def _path_class() -> type:
     class Path(mi.SamplingIntegrator):
-        def __init__(self, depth):
+        def __init__(self, depth, alpha):
             super().__init__(mi.Properties())
-            self.depth = depth
+            self.depth, self.alpha = depth, alpha
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             state = (
@@ -232,11 +240,14 @@ def _path_class() -> type:
                 mi.Bool(False),
             )
 
-            state = dr.while_loop(state, lambda *s: s[2], lambda *s: _next_surface(scene, self.depth, s), labels=LABELS)
+            def step(*state):
+                return _next_surface(scene, self.depth, self.alpha, state)
+
+            state = dr.while_loop(state, lambda *s: s[2], step, labels=LABELS)
             return state[5], state[10], []
 
         def to_string(self):
-            return f"Path[{self.depth}]"
+            return f"Path[{self.depth}, {self.alpha}]"
 
     return Path
 
@@ -247,8 +258,30 @@ def _power_heuristic(a: Any, b: Any) -> Any:
     return dr.select(total > 0, a * a / dr.select(total > 0, total, 1), 0)
 
 
-def _next_surface(scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Extends a path of at most `most` vertices by one surface: its emission, its direct light, and the next ray."""
+def _transmittance(scene: Any, si: Any, ds: Any, active: Any) -> Any:
+    """The share of a sampled emitter's light that crosses the surfaces between it and `si`; 0 behind an opaque one and
+    beyond PASSED surfaces."""
+
+    def going(ray, active, passed, share):
+        return active
+
+    def step(ray, active, passed, share):
+        crossed = scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
+        hit = active & crossed.is_valid()
+        clear = crossed.bsdf(ray).eval_null_transmission(crossed, hit & (passed < PASSED))
+        share = dr.select(hit, share * dr.select(passed < PASSED, clear, 0), share)
+        return crossed.spawn_ray_to(ds.p), hit & dr.any(share != 0), passed + 1, share
+
+    state = (si.spawn_ray_to(ds.p), mi.Bool(active), mi.UInt32(0), mi.Color3f(1))
+    return dr.while_loop(state, going, step, labels=("ray", "active", "passed", "share"))[3]
+
+
+def _next_surface(scene: Any, most: int, alpha: bool, state: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Extends a path of at most `most` vertices by one surface: its emission, its direct light, and the next ray.
+
+    With `alpha`, light that crosses surfaces is found by both strategies, so the weight of a later emitter is that of
+    the last surface which scattered. Without, nothing passes.
+    """
     sampler, ray, active, depth, passed, result, throughput, before, pdf, delta, valid = state
     ctx = mi.BSDFContext()
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
@@ -262,15 +295,20 @@ def _next_surface(scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, .
     goes = hit & (depth + 1 < most) & (passed < PASSED)
     surface = si.bsdf(ray)
     direct = goes & mi.has_flag(surface.flags(), mi.BSDFFlags.Smooth)
-    ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), True, direct)
+    ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), not alpha, direct)
     direct = direct & (ds.pdf != 0)
     value, at = surface.eval_pdf(ctx, si, si.to_local(ds.d), direct)
+    if alpha:
+        weight = weight * _transmittance(scene, si, ds, direct & dr.any(value * weight != 0))
     share = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, at))
     result = result + dr.select(direct, throughput * value * weight * share, 0)
     sampled, weight = surface.sample(ctx, si, sampler.next_1d(goes), sampler.next_2d(goes), goes)
     null = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
     valid = valid | (hit & ~null)
     throughput = dr.select(goes, throughput * weight, throughput)
+    at, by = mi.Interaction3f(si), (sampled.pdf, mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta))
+    if alpha:
+        at, by = dr.select(null, before, at), (dr.select(null, pdf, by[0]), dr.select(null, delta, by[1]))
     return (
         sampler,
         si.spawn_ray(si.to_world(sampled.wo)),
@@ -279,9 +317,8 @@ def _next_surface(scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, .
         passed + dr.select(null, mi.UInt32(1), mi.UInt32(0)),
         result,
         throughput,
-        mi.Interaction3f(si),
-        sampled.pdf,
-        mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta),
+        at,
+        *by,
         valid,
     )
 

@@ -437,7 +437,7 @@ def test_lamps_keep_their_light_and_unlit_goes_when_asked(tmp_path: Path) -> Non
             {"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_sheen": {}, "KHR_materials_clearcoat": {}}},
             ("KHR_materials_sheen", "stays", "renders here leave it out"),
         ),
-        ({"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_clearcoat": {}}}, ("clearcoat", "painted")),
+        ({"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_clearcoat": {}}}, ("clearcoat", "paintings")),
         (
             {"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_clearcoat": {"clearcoatTexture": {"index": 0}}}},
             ("KHR_materials_clearcoat", "not the textures"),
