@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mistyle.core.mesh import Mesh
+from mistyle.core.names import distinct
 
 UpAxis = Literal["y", "z", "-y", "-z"]  # of a file, that points up
 TURNED = " up to Y up"  # part of the note of every mesh that reading has turned
@@ -113,7 +114,7 @@ class Primitive:
     set, or -1 when the faces land in several UDIM tiles and `Mesh.part` decides face by face. On glTF
     `Mesh.faces[start:stop] - first_vertex` index the vertices of the primitive's own accessors; the faces are in the
     file's order (strips and fans spelled out), and where the node mirrors space their corners 1 and 2 are swapped.
-    `name` is the object's in formats that name objects without nodes (OBJ's o, or g where there is none).
+    `name` is the object's: of OBJ its o (g where there is none), of glTF the node's, of USD the prim's whole path.
     """
 
     node: int
@@ -165,3 +166,15 @@ class Asset:
     mesh: Mesh
     materials: tuple[Material, ...]
     source: Source
+
+
+def objects(asset: Asset) -> tuple[Int[np.ndarray, " f"], list[str]]:
+    """The object of every face, by number, and the objects' different names; the asset's where the source has none."""
+    numbers: dict[tuple[int, str], int] = {}
+    object_of_face = np.zeros(len(asset.mesh.faces), np.int32)
+    for p in asset.source.primitives:
+        object_of_face[p.start : p.stop] = numbers.setdefault((p.node, p.name), len(numbers))
+    names = [name for _, name in numbers] or [""]
+    if asset.source.kind == "usd":
+        names = [path.rsplit("/", 1)[-1] for path in names]
+    return object_of_face, distinct([name or asset.name for name in names], key=str)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.asset import TURNED, Material
+from mistyle.core.asset import TURNED, Material, objects
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.names import (
     IDENTIFIER,
@@ -20,7 +20,7 @@ from mistyle.core.names import (
     uses,
 )
 from mistyle.core.paths import real_path
-from mistyle.deliver.losses import features, losses, suffix_of_source
+from mistyle.deliver.losses import features, losses, source_losses, suffix_of_source
 from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.images.ocio import ColourSpace, exr_tags
 from mistyle.io.images.packing import FILM_HEIGHT, HEIGHT, TARGETS, Target, TextureSet, write_slot
@@ -111,7 +111,8 @@ def notes(finished: FinishedAsset, chosen: Delivery, found: Mapping[str, str]) -
     turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text][: "obj" in chosen.formats]
     up = [f"{chosen.name}.obj has Y up, which OBJ cannot state. {text}" for text in turned]
     layered = suffix_of_source(finished) in USD  # a look layer lies over its source, which has everything
-    return (*up, *losses(found, [f for f in chosen.formats if not (f == "usd" and layered)]))
+    kept = losses(found, [f for f in chosen.formats if not (f == "usd" and layered)])
+    return (*up, *source_losses(finished.manifest.get("notes", ()), chosen.formats), *kept)
 
 
 def height_of(slot: Any, textures: TextureSet) -> dict[str, float]:
@@ -219,7 +220,7 @@ def _materials(
     tiles = [textures.tile for textures in finished.sets]
     mesh, positions = finished.asset.mesh, finished.asset.source.user_positions
     if "obj" in chosen.formats:
-        write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks)
+        write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks, objects(finished.asset))
     if "mtlx" in chosen.formats:
         write_materialx(folder / f"{chosen.name}.mtlx", looks)
     if "usd" in chosen.formats and suffix_of_source(finished) in USD:

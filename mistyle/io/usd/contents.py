@@ -22,7 +22,7 @@ def unheld_notes(pxr: Any, stage: Any) -> list[str]:
     words = {
         "skin": "a skin and its skeleton" if counts["skeleton"] < 2 else f"skins with {counts['skeleton']} skeletons",
         "blend shapes": f"blend shapes ({counts['blend shapes']})",
-        "animation": f"an animation ({_listed([f'{counts[k]} {k}' for k in MOVING if counts[k]])})",
+        "animation": f"an animation ({_listed([f'{k}: {counts[k]}' for k in MOVING if counts[k]])})",
         "cameras": f"cameras ({counts['cameras']})",
         "lights": f"lights ({counts['lights']})",
     }

@@ -412,3 +412,47 @@ def test_a_look_binds_the_subsets_of_the_source(tmp_path: Path) -> None:
         for s in api(stage.GetPrimAtPath("/R/Q")).GetMaterialBindSubsets()
     }
     assert bound == {"f": "/R/look/front", "b": "/R/look/back"}
+
+
+MOVES = (
+    "    double3 xformOp:translate.timeSamples = { 1: (0, 0, 0), 24: (0, 1, 0) }\n"
+    '    uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+)
+VARIANTS = 'def Xform "V" ( variants = { string finish = "a" }\n    prepend variantSets = "finish" )\n'
+VARIANTS += '{\n    variantSet "finish" = { "a" { } "b" { } }\n}\n'
+
+
+@pytest.mark.parametrize(
+    ("extra", "around", "held"),
+    [
+        ("", "", None),
+        (MOVES, "", "an animation (moving prims: 1)"),
+        ("", 'def Camera "C" {}\ndef Camera "D" {}\ndef SphereLight "L" {}\n', "cameras (2) and lights (1)"),
+        ("", VARIANTS, "further variants of 'finish'"),
+    ],
+)
+def test_contents_that_stay_in_the_file_are_noted(extra: str, around: str, held: str | None, tmp_path: Path) -> None:
+    from mistyle.deliver.losses import source_losses
+
+    notes = read(tmp_path, plate(extra), around).notes
+    sentences = source_losses(notes, ["glb", "usd", "obj", "maps"])
+    assert sentences == (() if held is None else (f"GLB and OBJ lack {held}, which the USD source has.",))
+    assert source_losses(notes, ["usd", "maps"]) == ()
+
+
+def test_a_skin_and_its_animation_are_noted(tmp_path: Path) -> None:
+    rig = 'def Skeleton "S" {}\ndef SkelAnimation "A"\n{\n    float3[] translations.timeSamples = '
+    rig += "{ 1: [(0, 0, 0)], 2: [(0, 1, 0)] }\n}\n"
+    binding = f'def Mesh "W" ( prepend apiSchemas = ["SkelBindingAPI"] )\n{{\n{ST}}}\ndef BlendShape "B" {{}}\n'
+    held = "a skin and its skeleton, blend shapes (1) and an animation (moving skeletons: 1)"
+    assert f"The USD file has {held}, which the asset lacks." in read(tmp_path, plate(""), rig, binding).notes
+
+
+def test_an_object_has_the_last_part_of_its_path(tmp_path: Path) -> None:
+    from mistyle.core.asset import objects
+
+    second = f'def Xform "G"\n{{\n{plate("")}}}\n'
+    asset = read_mesh(write(tmp_path, plate(""), second), uv="auto", size=16)
+    number, names = objects(asset)
+    assert names == ["Q", "Q_2"] and number.tolist() == [0, 0, 1, 1]
+    assert [p.name for p in asset.source.primitives] == ["/R/Q", "/R/G/Q"]
