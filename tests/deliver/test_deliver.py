@@ -383,7 +383,10 @@ def test_a_name_of_an_object_stays_on_its_line(name, line, tmp_path):
     from mistyle.io.materialx import TexturedMaterial
     from mistyle.io.meshes.obj_write import write_obj
 
-    mesh, look = quad().mesh, TexturedMaterial("m", *(f"{k}.png" for k in ("albedo", "normal", "roughness", "metallic")))
+    mesh, look = (
+        quad().mesh,
+        TexturedMaterial("m", *(f"{k}.png" for k in ("albedo", "normal", "roughness", "metallic"))),
+    )
     write_obj(tmp_path / "a.obj", mesh, mesh.positions, [1001], [look], (np.zeros(len(mesh.faces), np.int32), [name]))
     lines = (tmp_path / "a.obj").read_text(encoding="utf-8").splitlines()
     assert line in lines and sum(each.startswith("v ") for each in lines) == len(mesh.positions)
