@@ -255,7 +255,7 @@ def _add_render(verbs: Any) -> None:
 def _add_bake(verbs: Any) -> None:
     verb = verbs.add_parser(
         "bake",
-        help="project pictures of known cameras onto the texture",
+        help="project pictures of known cameras onto the texture: their colours become the albedo",
         **examples(
             """
             mistyle bake bunny.obj views/ -o baked/

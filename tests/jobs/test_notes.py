@@ -35,6 +35,21 @@ def test_notes_of_the_mesh_are_printed_at_the_end_and_in_json(verb_inputs, tmp_p
         assert [line for line in again if line.startswith("note      ")] == lines
 
 
+@pytest.mark.parametrize("lights", [True, False])
+def test_baking_lit_views_is_noted(verb_inputs, tmp_path, capsys, lights):
+    """The sequence of the README: `render`, then `bake`."""
+    views = tmp_path / "views"
+    assert main([*VERBS["render"].words(verb_inputs, views)]) == 0
+    if not lights:
+        (views / "lights.json").unlink()
+    capsys.readouterr()
+    words = ["bake", str(verb_inputs / "square.obj"), str(views), "-o", str(tmp_path / "out"), "--atlas", "64", "--json"]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert any("lights.json" in text and "mistyle fit" in text for text in json.loads(captured.out)["notes"]) == lights
+    assert ("note      The folder of the pictures has lights.json" in captured.err) == lights
+
+
 def test_a_note_made_in_a_stage_is_said_again_where_the_stage_is_taken_over(tmp_path):
     from mistyle.jobs.stages import Run
     from mistyle.stylization.pipeline.job import STAGES, Job

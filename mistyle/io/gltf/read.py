@@ -233,8 +233,9 @@ def _instances(
     if fit < len(matrices):
         cause = "a fixed limit" if limit == MAX_INSTANCED else "by read.max_faces"
         notes.append(
-            f"Only the first {fit} of {len(matrices)} instances ({INSTANCING}) of a mesh with {corners // 3} faces were "
-            f"read: instances are read up to {max(limit, 0)} faces of the scene ({cause}). All show the same texels."
+            f"Only the first {fit} of {len(matrices)} instances ({INSTANCING}) of a mesh with {corners // 3} faces "
+            f"were read: instances are read up to {max(limit, 0)} faces of the scene ({cause}). All show the same "
+            "texels."
         )
     return matrices[:fit]
 

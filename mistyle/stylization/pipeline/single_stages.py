@@ -85,12 +85,21 @@ def files_of_views(settings: Settings) -> list[str]:
     return file_names([camera.name for camera in cameras], settings.draw.paper_files)
 
 
+LIT = (
+    "The folder of the pictures has lights.json: they show its light and shadow, which the albedo now holds. "
+    "`mistyle fit` separates light from albedo; take the file away where pictures show albedo alone."
+)
+
+
 def bake_views(
     mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
-    """`mistyle bake`: project pictures of known cameras onto the texture (section 4.1.4)."""
+    """`mistyle bake`: project pictures of known cameras onto the texture (section 4.1.4).
+
+    The pictures' colours become the albedo as they are; a note names light that they are known to show.
+    """
     from mistyle.deliver.asset import asset_names
-    from mistyle.io.cameras.views import read_views, view_cameras
+    from mistyle.io.cameras.views import is_lit, read_views, view_cameras
 
     inputs = claim_baked(mesh, views, out, name, overwrite)
     sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]
@@ -102,6 +111,7 @@ def bake_views(
         progress.note(*asset.source.notes)
         look_again(*size_of(asset))
         pictures = read_views(views)
+        progress.note(*([LIT] if is_lit(views) else []))
         tell_views(asset.mesh, pictures, progress)
         seen_by = with_geometry(asset, pictures)
         shares: list[float] = []
