@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mistyle.core.mesh import Mesh
-from mistyle.core.names import distinct
 
 UpAxis = Literal["y", "z", "-y", "-z"]  # of a file, that points up
 TURNED = " up to Y up"  # part of the note of every mesh that reading has turned
@@ -166,15 +165,3 @@ class Asset:
     mesh: Mesh
     materials: tuple[Material, ...]
     source: Source
-
-
-def objects(asset: Asset) -> tuple[Int[np.ndarray, " f"], list[str]]:
-    """The object of every face, by number, and the objects' different names; the asset's where the source has none."""
-    numbers: dict[tuple[int, str], int] = {}
-    object_of_face = np.zeros(len(asset.mesh.faces), np.int32)
-    for p in asset.source.primitives:
-        object_of_face[p.start : p.stop] = numbers.setdefault((p.node, p.name), len(numbers))
-    names = [name for _, name in numbers] or [""]
-    if asset.source.kind == "usd":
-        names = [path.rsplit("/", 1)[-1] for path in names]
-    return object_of_face, distinct([name or asset.name for name in names], key=str)

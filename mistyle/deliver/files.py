@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.asset import TURNED, Material, objects
+from mistyle.core.asset import TURNED, Material
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.names import (
     IDENTIFIER,
@@ -26,6 +26,7 @@ from mistyle.io.images.ocio import ColourSpace, exr_tags
 from mistyle.io.images.packing import FILM_HEIGHT, HEIGHT, TARGETS, Target, TextureSet, write_slot
 from mistyle.io.materialx import HeightFile, TexturedMaterial, Transparency, write_materialx
 from mistyle.io.meshes.obj_write import write_obj
+from mistyle.io.meshes.objects import objects
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
 

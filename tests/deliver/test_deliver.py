@@ -385,7 +385,7 @@ def test_a_name_of_an_object_stays_on_its_line(name, line, tmp_path):
 
     mesh, look = (
         quad().mesh,
-        TexturedMaterial("m", *(f"{k}.png" for k in ("albedo", "normal", "roughness", "metallic"))),
+        TexturedMaterial("m", "albedo.png", "normal.png", "roughness.png", "metallic.png"),
     )
     write_obj(tmp_path / "a.obj", mesh, mesh.positions, [1001], [look], (np.zeros(len(mesh.faces), np.int32), [name]))
     lines = (tmp_path / "a.obj").read_text(encoding="utf-8").splitlines()

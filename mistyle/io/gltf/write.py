@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle import __version__
-from mistyle.core.asset import Asset, objects
+from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import local_origin, weld
 from mistyle.core.rows import corner_rows, distinct
@@ -19,6 +19,7 @@ from mistyle.geometry.tangents import mikktspace
 from mistyle.io.gltf.glb import Builder, Tree, unit_normals
 from mistyle.io.gltf.patch import patch_tree
 from mistyle.io.images.textures import Pictures, add_textures, encode_pictures, part_stems, set_textures
+from mistyle.io.meshes.objects import objects
 from mistyle.io.store.atomic import atomic_write
 
 

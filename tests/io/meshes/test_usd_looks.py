@@ -398,7 +398,7 @@ def test_a_look_binds_the_subsets_of_the_source(tmp_path: Path) -> None:
     parts = subset("f", 0, "/Materials/front") + subset("b", 1, "/Materials/back")
     path = write(tmp_path, two_plates(parts))
     asset = read_mesh(path, uv="keep", size=16)
-    looks = [TexturedMaterial(part, *(f"{part}_{k}.png" for k in "anrm")) for part in asset.mesh.parts]
+    looks = [TexturedMaterial(p, f"{p}_a.png", f"{p}_n.png", f"{p}_r.png", f"{p}_m.png") for p in asset.mesh.parts]
     for part in asset.mesh.parts:
         for k in "anrm":
             Image.new("RGB", (2, 2)).save(tmp_path / f"{part}_{k}.png")
@@ -449,7 +449,7 @@ def test_a_skin_and_its_animation_are_noted(tmp_path: Path) -> None:
 
 
 def test_an_object_has_the_last_part_of_its_path(tmp_path: Path) -> None:
-    from mistyle.core.asset import objects
+    from mistyle.io.meshes.objects import objects
 
     second = f'def Xform "G"\n{{\n{plate("")}}}\n'
     asset = read_mesh(write(tmp_path, plate(""), second), uv="auto", size=16)
