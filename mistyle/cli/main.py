@@ -239,6 +239,7 @@ def _add_render(verbs: Any) -> None:
             mistyle render bunny.obj -o turn/ --rig turntable --resolution 512 --spp 64
             mistyle render chair.glb -o views/ --rig nbv --set rig.most_views=16
             mistyle render chair.glb -o views/ --rig transforms.json --paper-files
+            mistyle render chair.glb -o flat/ --unlit
             """
         ),
     )
@@ -247,6 +248,7 @@ def _add_render(verbs: Any) -> None:
     add_job_options(verb)
     add_mesh_options(verb)
     _add_view_options(verb)
+    verb.add_argument("--unlit", action="store_true", help="views of the albedo without light, for painting and `bake`")
     _add_dry_run(verb)
     add_memory_option(verb)
     verb.set_defaults(command=_render)
@@ -255,7 +257,7 @@ def _add_render(verbs: Any) -> None:
 def _add_bake(verbs: Any) -> None:
     verb = verbs.add_parser(
         "bake",
-        help="project pictures of known cameras onto the texture",
+        help="project pictures of known cameras onto the texture: their colours become the albedo",
         **examples(
             """
             mistyle bake bunny.obj views/ -o baked/
@@ -416,7 +418,9 @@ def _render(options: argparse.Namespace) -> int:
     from mistyle.stylization.pipeline.single_stages import render_views
 
     progress = Progress()
-    written = render_views(options.mesh, options.out, settings, progress, overwrite=options.overwrite)
+    written = render_views(
+        options.mesh, options.out, settings, progress, overwrite=options.overwrite, unlit=options.unlit
+    )
     record = {"views": [str(p) for p in written], "notes": progress.notes}
     print(json.dumps(record) if options.json else f"views     {options.out}")
     progress.tell_notes()

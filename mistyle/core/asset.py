@@ -115,7 +115,7 @@ class Primitive:
     set, or -1 when the faces land in several UDIM tiles and `Mesh.part` decides face by face. On glTF
     `Mesh.faces[start:stop] - first_vertex` index the vertices of the primitive's own accessors; the faces are in the
     file's order (strips and fans spelled out), and where the node mirrors space their corners 1 and 2 are swapped.
-    `name` is the object's in formats that name objects without nodes (OBJ's o, or g where there is none).
+    `name` is the object's: of OBJ its o (g where there is none), of glTF the node's, of USD the prim's whole path.
     """
 
     node: int

@@ -20,12 +20,13 @@ from mistyle.core.names import (
     uses,
 )
 from mistyle.core.paths import real_path
-from mistyle.deliver.losses import features, losses, suffix_of_source
+from mistyle.deliver.losses import features, losses, source_losses, suffix_of_source
 from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.images.ocio import ColourSpace, exr_tags
 from mistyle.io.images.packing import FILM_HEIGHT, HEIGHT, TARGETS, Target, TextureSet, write_slot
 from mistyle.io.materialx import HeightFile, TexturedMaterial, Transparency, write_materialx
 from mistyle.io.meshes.obj_write import write_obj
+from mistyle.io.meshes.objects import objects
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
 
@@ -111,7 +112,8 @@ def notes(finished: FinishedAsset, chosen: Delivery, found: Mapping[str, str]) -
     turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text][: "obj" in chosen.formats]
     up = [f"{chosen.name}.obj has Y up, which OBJ cannot state. {text}" for text in turned]
     layered = suffix_of_source(finished) in USD  # a look layer lies over its source, which has everything
-    return (*up, *losses(found, [f for f in chosen.formats if not (f == "usd" and layered)]))
+    kept = losses(found, [f for f in chosen.formats if not (f == "usd" and layered)])
+    return (*up, *source_losses(finished.manifest.get("notes", ()), chosen.formats), *kept)
 
 
 def height_of(slot: Any, textures: TextureSet) -> dict[str, float]:
@@ -219,7 +221,7 @@ def _materials(
     tiles = [textures.tile for textures in finished.sets]
     mesh, positions = finished.asset.mesh, finished.asset.source.user_positions
     if "obj" in chosen.formats:
-        write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks)
+        write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks, objects(finished.asset))
     if "mtlx" in chosen.formats:
         write_materialx(folder / f"{chosen.name}.mtlx", looks)
     if "usd" in chosen.formats and suffix_of_source(finished) in USD:

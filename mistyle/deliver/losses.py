@@ -14,7 +14,8 @@ from mistyle.io.gltf.variants import variants
 
 Tree = Mapping[str, Any]
 GLTF = (".glb", ".gltf")
-UNREAD = re.compile(r"Only the first of (\d+) instances")  # a note of io/gltf/read.py
+LACKING = re.compile(r"The USD file has (.+), which the asset lacks\.")  # a note of io/usd/contents.py
+UNREAD = re.compile(r"Only the first (\d+) of (\d+) instances")  # a note of io/gltf/read.py
 LABELS = {"usd": "USD", "obj": "OBJ", "mtlx": "MaterialX", "maps": "the maps"}
 
 # Kinds of features that are about the mesh: MaterialX and maps have none, so they lose none.
@@ -68,6 +69,16 @@ def losses(found: Mapping[str, str], formats: Sequence[str]) -> tuple[str, ...]:
     return tuple(result)
 
 
+def source_losses(notes: Iterable[str], formats: Sequence[str]) -> tuple[str, ...]:
+    """The sentence on the contents of a USD source that its GLB and OBJ lack; `notes` are those of its reading."""
+    without = [label for f, label in (("glb", "GLB"), ("obj", "OBJ")) if f in formats]
+    held = [match[1] for match in map(LACKING.fullmatch, notes) if match]
+    if not without:
+        return ()
+    verb = "lacks" if len(without) == 1 else "lack"
+    return tuple(f"{_listed(without)} {verb} {text}, which the USD source has." for text in held)
+
+
 def mesh_features(tree: Tree, notes: Sequence[str] = ()) -> dict[str, str]:
     """The features of a glTF's scene besides one mesh, by kind; `notes` are those of its reading."""
     nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
@@ -75,7 +86,7 @@ def mesh_features(tree: Tree, notes: Sequence[str] = ()) -> dict[str, str]:
     placed = [node["mesh"] for node in nodes if "mesh" in node]
     copied = sum(placed.count(mesh) for mesh in set(placed) if placed.count(mesh) > 1)
     lights = _count(_items(_items(tree.get("extensions")).get("KHR_lights_punctual")), "lights")
-    unread = next((f"all but the first of {m[1]} instances" for m in map(UNREAD.match, notes) if m), "")
+    unread = next((f"all but the first {m[1]} of {m[2]} instances" for m in map(UNREAD.match, notes) if m), "")
     gpu = _extended(nodes, "EXT_mesh_gpu_instancing")
     found = {
         "hierarchy": len(nodes) > 1 and f"the hierarchy of {len(nodes)} nodes with their names and pivots",

@@ -347,3 +347,46 @@ def test_the_verb_export_takes_commas_and_several_targets(single, tmp_path, caps
     assert {Path(f).relative_to(tmp_path / "out").parts[0] for f in files} == {"unreal", "unity-urp"}
     assert main([*arguments[:-1], "--name", "{nothing}"]) == 2
     assert "--name" in capsys.readouterr().err
+
+
+def test_objects_of_an_obj_keep_their_names(tmp_path):
+    from mistyle.io.meshes.obj_read import read_obj
+    from mistyle.io.read_mesh import read_mesh
+
+    rows = [(x, y, z) for z in (0, 1, 2) for x, y in ((0, 0), (1, 0), (0, 1))]
+    lines = [f"v {x} {y} {z}" for x, y, z in rows] + ["vt 0 0", "vt 1 0", "vt 0 1"]
+    lines += ["g left arm", "usemtl a", "f 1/1 2/2 3/3", "g head", "usemtl b", "f 4/1 5/2 6/3", "usemtl a"]
+    lines += ["f 7/1 8/2 9/3"]
+    source = tmp_path / "three.obj"
+    source.write_text("\n".join(lines) + "\n")
+    asset = read_mesh(source, uv="auto", size=16)
+    parts = len(asset.mesh.parts)
+    write_asset(
+        tmp_path / "run" / "asset", "three", asset, [quarters()] * parts, [OCCLUSION] * parts, [no_texels()] * parts,
+        provenance={},
+    )  # fmt: skip
+    export(tmp_path / "run", tmp_path / "out", DeliveryRequest(formats=["obj"], target="blender"))
+    text = (tmp_path / "out" / "three.obj").read_text().splitlines()
+    assert [line for line in text if line.startswith(("o ", "usemtl "))] == [
+        "o left arm", "usemtl a", "o head", "usemtl a", "usemtl b",
+    ]  # fmt: skip
+    found = read_obj(tmp_path / "out" / "three.obj", 100)
+    assert [p.name for p in found.primitives if p.stop > p.start] == ["left arm", "head", "head"]
+    heights = {p.name: set(found.positions[found.faces[p.start : p.stop]][..., 2].ravel()) for p in found.primitives}
+    assert len(found.faces) == 3 and heights["left arm"] == {0}
+
+
+@pytest.mark.parametrize(
+    ("name", "line"), [("a\nv 1", "o a v 1"), ("back\\", "o back"), ("\ud800", "o object"), ("Nase ö", "o Nase ö")]
+)
+def test_a_name_of_an_object_stays_on_its_line(name, line, tmp_path):
+    from mistyle.io.materialx import TexturedMaterial
+    from mistyle.io.meshes.obj_write import write_obj
+
+    mesh, look = (
+        quad().mesh,
+        TexturedMaterial("m", "albedo.png", "normal.png", "roughness.png", "metallic.png"),
+    )
+    write_obj(tmp_path / "a.obj", mesh, mesh.positions, [1001], [look], (np.zeros(len(mesh.faces), np.int32), [name]))
+    lines = (tmp_path / "a.obj").read_text(encoding="utf-8").splitlines()
+    assert line in lines and sum(each.startswith("v ") for each in lines) == len(mesh.positions)

@@ -120,9 +120,9 @@ def test_a_plain_glb_has_no_features():
 def test_instances_that_were_not_read_are_told():
     node = {"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}
     tree = {"nodes": [node], "meshes": [{"primitives": []}]}
-    notes = ["Only the first of 12 instances (EXT_mesh_gpu_instancing) was read; all show the same texels."]
+    notes = ["Only the first 3 of 12 instances (EXT_mesh_gpu_instancing) of a mesh with 8 faces were read: ..."]
     assert losses(mesh_features(tree, notes), ["usd"]) == (
-        "USD lacks all but the first of 12 instances, which the GLB has.",
+        "USD lacks all but the first 3 of 12 instances, which the GLB has.",
     )
     assert "instancing on the GPU" in mesh_features(tree)["unread instances"]
 

@@ -3,7 +3,9 @@
 import json
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from mistyle.cli.main import main
 from mistyle.jobs.progress import Progress, grouped
@@ -11,6 +13,15 @@ from mistyle.stylization.optimise.judge import TOLERANCE, regressed, undone_wher
 from mistyle.stylization.report import summary
 from mistyle.stylization.report.page import fit_facts
 from tests.support.verbs import VERBS
+
+
+def read_albedo(mesh) -> np.ndarray:
+    """The colour of the file's one material, in sRGB of 8 bits."""
+    from mistyle.core.image import srgb_from_linear
+    from mistyle.io.read_mesh import read_mesh
+
+    return np.round(255 * srgb_from_linear(np.array(read_mesh(mesh).materials[0].albedo_factor)))
+
 
 NOTE = "The mesh has no normals"  # of the square: smooth ones are computed
 
@@ -33,6 +44,26 @@ def test_notes_of_the_mesh_are_printed_at_the_end_and_in_json(verb_inputs, tmp_p
         assert main(words) == 0
         again = capsys.readouterr().err.splitlines()
         assert [line for line in again if line.startswith("note      ")] == lines
+
+
+@pytest.mark.parametrize("lights", [True, False])
+def test_lit_views_are_noted_and_unlit_ones_keep_the_albedo(tmp_path, capsys, lights):
+    """The sequence of the README: `render`, then `bake`."""
+    mesh, views, out = tmp_path / "plate.obj", tmp_path / "views", tmp_path / "out"
+    corners = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    mesh.write_text(f"mtllib plate.mtl\n{corners}usemtl paint\nf 1/1 2/2 3/3 4/4\n")
+    (tmp_path / "plate.mtl").write_text("newmtl paint\nKd 1 0.6867 0\n")
+    unlit = [] if lights else ["--unlit"]
+    assert main(["render", str(mesh), "-o", str(views), "--resolution", "64", *unlit]) == 0
+    assert bool(json.loads((views / "lights.json").read_text())["lights"]) == lights
+    capsys.readouterr()
+    assert main(["bake", str(mesh), str(views), "-o", str(out), "--atlas", "64", "--json"]) == 0
+    with Image.open(out / "textures" / "plate_albedo.png") as picture:
+        middle = np.asarray(picture.convert("RGB"), int)[16:48, 16:48].reshape(-1, 3)
+    assert (np.abs(middle - read_albedo(mesh)).max() <= 1) == (not lights)
+    captured = capsys.readouterr()
+    assert any("lights.json" in text and "mistyle fit" in text for text in json.loads(captured.out)["notes"]) == lights
+    assert ("note      The folder of the pictures has lights.json" in captured.err) == lights
 
 
 def test_a_note_made_in_a_stage_is_said_again_where_the_stage_is_taken_over(tmp_path):
@@ -83,3 +114,10 @@ def test_a_kept_phase_says_what_got_worse_within_the_tolerance():
     judged.figures["phase1.detail"] = (0.88, 0.90)
     assert dict(fit_facts(judged))["phase1"] == "kept; no figure got worse"
     assert dict(fit_facts(SimpleNamespace(kept={"phase1": True}, figures={})))["phase1"] == "kept, not judged"
+
+
+def test_unlit_views_have_no_scene(tmp_path, capsys):
+    scene = tmp_path / "room.xml"
+    scene.write_text('<scene version="3.0.0"/>')
+    words = ["render", str(tmp_path / "a.obj"), "-o", str(tmp_path / "out"), "--unlit", "--scene", str(scene)]
+    assert main(words) == 2 and "--unlit" in capsys.readouterr().err

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera, resized
+from mistyle.core.errors import InputRefused
 from mistyle.core.image import canny, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Lights, from_json, to_json
 from mistyle.core.paths import real_path
@@ -125,6 +126,16 @@ def read_lights(path: Path) -> Lights:
     path = Path(path)
     file = path / "lights.json" if path.is_dir() else path
     return from_json(read_json(file), str(file), lambda name: read_radiance(inside(file.parent, name, file, COPY)))
+
+
+def is_lit(folder: Path) -> bool:
+    """Whether a folder of views has a `lights.json` that lists at least one light; a file that is none says nothing."""
+    file = Path(folder) / "lights.json"
+    try:
+        data = read_json(file) if file.is_file() else {}
+    except InputRefused:
+        return False
+    return isinstance(data, dict) and bool(data.get("lights") or data.get("views"))
 
 
 def read_views(folder: Path) -> list[View]:

@@ -81,7 +81,9 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
     notes += variant_notes(tree, set(used))
     starts = np.cumsum([0, *counts])
     primitives = tuple(
-        Primitive(p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex)
+        Primitive(
+            p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex, _name(tree, p.node)
+        )
         for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
     )
     faces = np.concatenate([p.faces for p in pieces])
@@ -154,10 +156,11 @@ def _pieces(
     positions: list[np.ndarray] = []
     world = world_matrices(tree)
     faces = vertices = 0
-    for node in _scene_nodes(tree, notes):
+    nodes = [node for node in _scene_nodes(tree, notes) if "mesh" in tree["nodes"][node]]
+    later = sum(_corner_count(tree, tree["nodes"][node]) for node in nodes) // 3  # faces, one instance a node
+    for node in nodes:
         entry = tree["nodes"][node]
-        if "mesh" not in entry:
-            continue
+        later -= _corner_count(tree, entry) // 3
         matrix, joints = world[node], None
         if "skin" in entry:
             joints, root = joint_matrices(tree, buffers, entry["skin"], world, path)
@@ -168,7 +171,8 @@ def _pieces(
         if _flattened(matrix):
             notes.append("Nodes that are scaled to a point or a line were left out; they stay in the GLB.")
             continue
-        for instance in _instances(tree, buffers, entry, min(max_faces, MAX_INSTANCED) - faces, notes):
+        limit = min(MAX_INSTANCED, max_faces - later)
+        for instance in _instances(tree, buffers, entry, (faces, limit), notes):
             placed: dict[str, _Place] = {}
             for number, primitive in enumerate(tree["meshes"][entry["mesh"]]["primitives"]):
                 _check_counts(tree, primitive, max_faces, path)
@@ -208,17 +212,38 @@ def _vertices_of(primitive: Tree) -> str:
     return str([own, [target.get("POSITION") for target in primitive.get("targets", [])]])
 
 
-def _instances(tree: Tree, buffers: Buffers, node: Tree, room: int, notes: list[str]) -> list[np.ndarray]:
-    """The matrices of a node's instances; only the first where the faces of all exceed `room`."""
+def _corner_count(tree: Tree, node: Tree) -> int:
+    """The corners of one instance of a node's mesh."""
+    primitives = [p for p in tree["meshes"][node["mesh"]]["primitives"] if "POSITION" in p["attributes"]]
+    return sum(tree["accessors"][p.get("indices", p["attributes"]["POSITION"])]["count"] for p in primitives)
+
+
+def _instances(
+    tree: Tree, buffers: Buffers, node: Tree, count: tuple[int, int], notes: list[str]
+) -> list[Float[np.ndarray, "4 4"]]:
+    """The matrices of a node's instances, as many as fit and at least the first.
+
+    `count` is the number of faces that were read, and the number up to which instances are.
+    """
     matrices = instances(tree, buffers, node, notes)
     if len(matrices) <= 1 or "skin" in node:
         return matrices[:1]
-    primitives = [p for p in tree["meshes"][node["mesh"]]["primitives"] if "POSITION" in p["attributes"]]
-    corners = sum(tree["accessors"][p.get("indices", p["attributes"]["POSITION"])]["count"] for p in primitives)
-    if len(matrices) * corners > 3 * room:
-        notes.append(f"Only the first of {len(matrices)} instances ({INSTANCING}) was read; all show the same texels.")
-        return matrices[:1]
-    return matrices
+    corners, (faces, limit) = _corner_count(tree, node), count
+    fit = min(max(3 * (limit - faces) // max(corners, 1), 1), len(matrices))
+    if fit < len(matrices):
+        cause = "a fixed limit" if limit == MAX_INSTANCED else "by read.max_faces"
+        notes.append(
+            f"Only the first {fit} of {len(matrices)} instances ({INSTANCING}) of a mesh with {corners // 3} faces "
+            f"were read: instances are read up to {max(limit, 0)} faces of the scene ({cause}). All show the same "
+            "texels."
+        )
+    return matrices[:fit]
+
+
+def _name(tree: Tree, node: int) -> str:
+    """A node's name, that of its mesh, or ""."""
+    entry = tree["nodes"][node]
+    return str(entry.get("name") or tree["meshes"][entry["mesh"]].get("name") or "")
 
 
 def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:

@@ -19,6 +19,7 @@ from mistyle.geometry.tangents import mikktspace
 from mistyle.io.gltf.glb import Builder, Tree, unit_normals
 from mistyle.io.gltf.patch import patch_tree
 from mistyle.io.images.textures import Pictures, add_textures, encode_pictures, part_stems, set_textures
+from mistyle.io.meshes.objects import objects
 from mistyle.io.store.atomic import atomic_write
 
 
@@ -49,13 +50,13 @@ def write_glb(
         frame["translation"] = (rotation @ offset).tolist()
     if not np.array_equal(rotation, np.eye(3)):
         frame["rotation"] = _quaternion(rotation)
-    object_of_face, objects = _objects(asset)
+    object_of_face, names = objects(asset)
     tree: Tree = {
         "asset": {"version": "2.0", "generator": f"mistyle {__version__}", "extras": {"mistyle": provenance or {}}},
         "scene": 0,
-        "scenes": [{"name": name, "nodes": list(range(len(objects)))}],
-        "nodes": [{"name": each, "mesh": k, **frame} for k, each in enumerate(objects)],
-        "meshes": [{"name": each, "primitives": []} for each in objects],
+        "scenes": [{"name": name, "nodes": list(range(len(names)))}],
+        "nodes": [{"name": each, "mesh": k, **frame} for k, each in enumerate(names)],
+        "meshes": [{"name": each, "primitives": []} for each in names],
     }
     builder = Builder(tree, [])
     for part, stem in enumerate(part_stems(name, asset.mesh.parts)):
@@ -95,15 +96,6 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
     from scipy.spatial.transform import Rotation
 
     return (Rotation.from_matrix(rotation).as_quat(canonical=True) + 0.0).tolist()
-
-
-def _objects(asset: Asset) -> tuple[Int[np.ndarray, " f"], list[str]]:
-    """The object of every face, by number, and the objects' names; the asset's name where the source has none."""
-    numbers: dict[str, int] = {}
-    object_of_face = np.zeros(len(asset.mesh.faces), np.int32)
-    for p in asset.source.primitives:
-        object_of_face[p.start : p.stop] = numbers.setdefault(p.name or asset.name, len(numbers))
-    return object_of_face, list(numbers) or [asset.name]
 
 
 def _primitives(

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from mistyle.core import names as safe
 from mistyle.core.mesh import Mesh
 from mistyle.core.rows import distinct
 from mistyle.io.materialx import TexturedMaterial
@@ -13,9 +14,16 @@ from mistyle.io.store.atomic import atomic_write
 
 
 def write_obj(
-    path: Path, mesh: Mesh, positions: Float[np.ndarray, "v 3"], tiles: Sequence[int], looks: Sequence[TexturedMaterial]
+    path: Path,
+    mesh: Mesh,
+    positions: Float[np.ndarray, "v 3"],
+    tiles: Sequence[int],
+    looks: Sequence[TexturedMaterial],
+    objects: tuple[Int[np.ndarray, " f"], Sequence[str]],
 ) -> None:
     """Write `path` and the .mtl beside it: the mesh with its own `positions`, one material per part.
+
+    `objects` are the number of every face's object and the objects' names: each has its faces after an `o` of its own.
 
     Vertices keep their order; equal UVs and normals are shared. `tiles` are the parts' UDIM tiles, to which
     their UVs are moved. Texture names are relative to the folder.
@@ -31,12 +39,25 @@ def write_obj(
     lines += [f"vt {u:.9g} {v:.9g}" for u, v in uv.tolist()]
     lines += [f"vn {x:.7g} {y:.7g} {z:.7g}" for x, y, z in normal.tolist()]
     corners = np.stack([mesh.faces.reshape(-1), uv_of, normal_of], axis=1).reshape(-1, 3, 3) + 1
-    for part, look in enumerate(looks):
-        lines.append(f"usemtl {look.title or look.name}")
-        for face in corners[mesh.part == part].tolist():
+    object_of_face, names = objects
+    order = np.lexsort((mesh.part, object_of_face))
+    owner, part = object_of_face[order], mesh.part[order]
+    starts = np.flatnonzero(np.r_[True, (np.diff(owner) != 0) | (np.diff(part) != 0)])
+    titles = safe.distinct([_line(name) for name in names], key=str)
+    for k, (start, stop) in enumerate(zip(starts, [*starts[1:], len(order)], strict=True)):
+        if k == 0 or owner[start] != owner[start - 1]:
+            lines.append(f"o {titles[owner[start]]}")
+        lines.append(f"usemtl {looks[part[start]].title or looks[part[start]].name}")
+        for face in corners[order[start:stop]].tolist():
             lines.append("f " + " ".join("/".join(map(str, corner)) for corner in face))
     atomic_write(path, ("\n".join(lines) + "\n").encode())
     atomic_write(path.with_suffix(".mtl"), _materials(looks).encode())
+
+
+def _line(name: str) -> str:
+    """A name that fits a line of OBJ: without control characters and without a backslash, which joins lines."""
+    shown = "".join(c if c.isprintable() and c != "\\" else " " for c in name)
+    return " ".join(shown.split()) or "object"
 
 
 def _digits(positions: Float[np.ndarray, "v 3"]) -> int:

@@ -192,13 +192,22 @@ def _cut(pxr: Any, stage: Any, prim: Any, shape: Polygons) -> None:
 def _bind(
     pxr: Any, stage: Any, source: _SourceMesh, part: np.ndarray, names: Any, looks: Sequence[TexturedMaterial]
 ) -> None:
-    """Bind a mesh, or a subset per part in the place of the source's own subsets."""
+    """Bind a mesh and its subsets; where these do not fit the parts, a subset per part takes their place."""
     api = pxr.UsdShade.MaterialBindingAPI
     prim = stage.GetPrimAtPath(source.name)
     parts = np.unique(part)
-    for subset in api(prim).GetMaterialBindSubsets():
-        if not subset.GetPrim().GetName().startswith(f"{SET}_"):
-            subset.GetPrim().SetActive(False)
+    subsets = [s for s in api(prim).GetMaterialBindSubsets() if not s.GetPrim().GetName().startswith(f"{SET}_")]
+    own = None if _is_cut(stage, source.name) else _parts_of_subsets(pxr, subsets, source.shape, part)
+    if own is not None:
+        rest, of_subset = own
+        _bound(pxr, stage, prim, names[parts[0] if rest is None else rest])
+        for subset, k in zip(subsets, of_subset, strict=True):
+            _bound(pxr, stage, subset.GetPrim(), names[k]) if k is not None else None
+        if subsets and api(prim).GetMaterialBindSubsetsFamilyType() == pxr.UsdGeom.Tokens.unrestricted:
+            api(prim).SetMaterialBindSubsetsFamilyType(pxr.UsdGeom.Tokens.nonOverlapping)
+        return
+    for subset in subsets:
+        subset.GetPrim().SetActive(False)
     _bound(pxr, stage, prim, names[parts[0]])
     if len(parts) == 1:
         return
@@ -214,6 +223,23 @@ def _bind(
     whole = len(taken) == len(mesh.GetFaceVertexCountsAttr().Get())
     kind = pxr.UsdGeom.Tokens.partition if whole else pxr.UsdGeom.Tokens.nonOverlapping
     api(mesh).SetMaterialBindSubsetsFamilyType(kind)
+
+
+def _parts_of_subsets(
+    pxr: Any, subsets: Sequence[Any], shape: Polygons, part: np.ndarray
+) -> tuple[int | None, list[int | None]] | None:
+    """The part of the faces outside all subsets and that of each subset (None: no faces); None where one has several
+    parts."""
+    outside, found = np.ones(len(part), bool), []
+    for subset in subsets:
+        rows = np.array(subset.GetIndicesAttr().Get(pxr.Usd.TimeCode.EarliestTime()) or [], np.int64)
+        inside = np.isin(shape.polygon, rows)
+        outside &= ~inside
+        found.append(np.unique(part[inside]).tolist())
+    rest, *of_subset = [np.unique(part[outside]).tolist(), *found]
+    if len(rest) > 1 or any(len(own) > 1 for own in of_subset):
+        return None
+    return next(iter(rest), None), [next(iter(own), None) for own in of_subset]
 
 
 def _bound(pxr: Any, stage: Any, prim: Any, place: str) -> None:

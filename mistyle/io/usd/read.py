@@ -15,6 +15,8 @@ from mistyle.io.images.read import Budget
 from mistyle.io.meshes.parsed_mesh import Raw
 from mistyle.io.meshes.polygons import too_many
 from mistyle.io.sandbox.bounds import refuse
+from mistyle.io.usd.bindings import missing_binding, missing_notes
+from mistyle.io.usd.contents import unheld_notes
 from mistyle.io.usd.layers import check_layers, textures_named, tiles_of, usd_folders
 from mistyle.io.usd.materials import UsdMaterial, at_own_coordinates, outside, plain, read_material
 from mistyle.io.usd.mesh import CornerValues, Polygons, corner_normals, is_cage, polygons, table_of, triples
@@ -47,18 +49,28 @@ class _Reading:
         self.time = pxr.Usd.TimeCode.EarliestTime()
         self.notes: list[str] = []
         self.materials: list[UsdMaterial] = []
+        self.missing: list[str] = []  # paths of bound materials that the stage does not have
         self._numbers: dict[str, int] = {}
         self._budget, self._folders = Budget(path), usd_folders(path)
 
-    def number(self, material: Any, shown: UsdMaterial) -> int:
-        """The index in `materials` of a bound material; that of `shown` where none is bound."""
-        display = shown.material
+    def number(self, prim: Any, shown: UsdMaterial) -> tuple[int, bool]:
+        """The index in `materials` of the material bound to `prim`, and whether one is.
+
+        A bound material that the stage does not have looks like `shown` and has its own name; without a binding the
+        material is `shown`.
+        """
+        material, display = _material_of(self.pxr, prim, self.notes), shown.material
         key = str(material.GetPath()) if material else f"{display.albedo_factor} {shown.colour} {display.shading}"
+        path = "" if material else missing_binding(self.pxr, prim)
+        if path:
+            self.missing += [path] if path not in self.missing else []
+            key = f"{path} {key}"
+            shown = replace(shown, material=replace(display, name=path.rsplit("/", 1)[-1]))
         if key not in self._numbers:
             self._numbers[key] = len(self.materials)
             arguments = (self._folders, self._budget, self.time, self.notes)
             self.materials.append(read_material(self.pxr, material, *arguments) if material else shown)
-        return self._numbers[key]
+        return self._numbers[key], bool(material or path)
 
 
 def files_of(path: Path) -> list[Path]:
@@ -78,6 +90,7 @@ def read_usd(path: Path, max_faces: int) -> Raw:
     pxr = library()
     reading = _Reading(pxr, path, max_faces)
     stage = open_stage(pxr, path, reading.notes)
+    reading.notes += unheld_notes(pxr, stage)
     pose(pxr, stage)
     user, pieces, faces = user_matrix(pxr, stage, reading.notes), [], 0
     for prim, owner, matrix in mesh_prims(pxr, stage, path, reading.notes):
@@ -88,7 +101,7 @@ def read_usd(path: Path, max_faces: int) -> Raw:
             pieces.append(piece)
     if not pieces:
         raise refuse(path, "no mesh on its stage", "at least one visible mesh", "Export the mesh itself")
-    return _raw(pieces, reading.materials, reading.notes)
+    return _raw(pieces, reading.materials, [*reading.notes, *missing_notes(reading.missing)])
 
 
 def _raw(pieces: list[_MeshPiece], materials: list[UsdMaterial], notes: list[str]) -> Raw:
@@ -189,10 +202,9 @@ def _bound(reading: _Reading, prim: Any, shape: Polygons) -> Int[np.ndarray, " f
     for subset in api(prim).GetMaterialBindSubsets():
         rows = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
         rows = rows[(rows >= 0) & (rows < len(of_polygon))]
-        of_polygon[rows] = reading.number(_material_of(pxr, subset.GetPrim(), notes), shown)
+        of_polygon[rows], _ = reading.number(subset.GetPrim(), shown)
     if (of_polygon < 0).any():
-        own = _material_of(pxr, prim, notes)
-        of_polygon[of_polygon < 0] = reading.number(own, shown)
+        of_polygon[of_polygon < 0], own = reading.number(prim, shown)
         colour = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
         if not own and not (colour and colour.HasValue()):
             notes.append(

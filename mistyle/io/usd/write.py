@@ -16,7 +16,8 @@ from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.core.mesh import Mesh, local_origin
 from mistyle.io.materialx import TexturedMaterial, Transparency
 
-NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "UsdValidation", "Vt")
+NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdLux", "UsdShade", "UsdSkel", "UsdUtils")
+NAMES += ("UsdValidation", "Vt")
 UTF8 = 1 << 11  # zip's flag for a name in UTF-8; without it readers assume code page 437
 FIRST_DAY = struct.pack("<HH", 0, 1 << 5 | 1)  # DOS time and date of 1980-01-01
 

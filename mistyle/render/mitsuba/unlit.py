@@ -33,13 +33,13 @@ def unlit(
     """
     device.use()
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
-    starts = np.cumsum([0, *(chosen.roughness.size for chosen in maps)])
+    starts = np.cumsum([0, *(chosen.albedo.size // 3 for chosen in maps)])
     flat = [np.ascontiguousarray(chosen.albedo, np.float32).reshape(-1) for chosen in maps]
     texels = mi.Float(whole(np.concatenate(flat) if len(flat) > 1 else flat[0]))
     del flat
     start = mi.UInt32(aligned(starts[:-1], np.uint32))
-    rows = mi.UInt32(aligned([chosen.roughness.shape[0] for chosen in maps], np.uint32))
-    columns = mi.UInt32(aligned([chosen.roughness.shape[1] for chosen in maps], np.uint32))
+    rows = mi.UInt32(aligned([chosen.albedo.shape[0] for chosen in maps], np.uint32))
+    columns = mi.UInt32(aligned([chosen.albedo.shape[1] for chosen in maps], np.uint32))
     part = mi.UInt32(aligned(traced.mesh.part, np.uint32))
 
     def fetch(hit: Any) -> Any:

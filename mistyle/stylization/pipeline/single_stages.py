@@ -1,6 +1,6 @@
 """The verbs `render` and `bake`: single stages for users who paint the views themselves."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset
+from mistyle.core.errors import UsageError
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
@@ -17,7 +18,7 @@ from mistyle.jobs.inputs import input_files
 from mistyle.jobs.job_settings import LEAST_OVERLAP
 from mistyle.jobs.memory_budget import kept, size_of
 from mistyle.jobs.plan import existing
-from mistyle.jobs.progress import Progress
+from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.start import read, start_engines
 from mistyle.stylization.pipeline.budget import (
     BAKE,
@@ -31,16 +32,21 @@ from mistyle.stylization.pipeline.budget import (
 )
 from mistyle.stylization.pipeline.job import Job
 from mistyle.stylization.pipeline.painting import with_geometry
-from mistyle.stylization.pipeline.start import draw, lay_out_one, own_maps
+from mistyle.stylization.pipeline.start import cameras_of, draw, lay_out_one, own_maps
 from mistyle.stylization.pipeline.stylize import write_asset
 from mistyle.stylization.settings import Settings
 
 
 def render_views(
-    mesh: Path, out: Path, settings: Settings, progress: Progress, *, overwrite: bool = False
+    mesh: Path, out: Path, settings: Settings, progress: Progress, *, overwrite: bool = False, unlit: bool = False
 ) -> list[Path]:
-    """`mistyle render`: the views of section 4.1.1 for any mesh."""
-    inputs = claim_views(mesh, out, settings, overwrite)
+    """`mistyle render`: the views of section 4.1.1 for any mesh; `unlit` ones show the albedo alone.
+
+    UsageError where unlit views should have the light of a scene.
+    """
+    if unlit and settings.draw.scene is not None:
+        raise UsageError(f"--unlit: unlit views cannot show {settings.draw.scene}; leave --scene or --unlit out")
+    inputs, drawing = claim_views(mesh, out, settings, overwrite), _draw_unlit if unlit else draw
     with kept(settings, existing(out), render_counts, RENDER, RENDER_TILED, DRAWN) as look_again:
         start_engines(settings)
         with progress.stage("mesh", "read the mesh") as report:
@@ -50,10 +56,33 @@ def render_views(
         maps = own_maps(asset, settings)
         with progress.stage("views", "render the views") as report:
             replace_files(
-                out, "render", lambda folder: draw(folder, asset, maps, settings, report, progress.note),
+                out, "render", lambda folder: drawing(folder, asset, maps, settings, report, progress.note),
                 inputs=inputs, overwrite=overwrite,
             )  # fmt: skip
     return sorted(out / name for name, entry in read_written(out).files.items() if entry.by == "render")
+
+
+def _draw_unlit(
+    folder: Path,
+    asset: Asset,
+    maps: Sequence[Maps],
+    settings: Settings,
+    report: Report,
+    say: Callable[[str], None],
+) -> None:
+    """`draw` without light: an empty lights.json lies beside the views."""
+    from mistyle.io.cameras.views import write_views
+    from mistyle.process import memory
+    from mistyle.render.mitsuba.draw import tracer, view_of
+    from mistyle.render.mitsuba.unlit import unlit
+
+    cameras, traced = cameras_of(settings, asset.mesh, say), tracer(asset.mesh)
+    pictures = unlit(traced, maps, cameras, progress=report)
+    views = [
+        memory.away(view_of(traced, camera, np.dstack([rgb, share])))
+        for camera, (rgb, share) in zip(cameras, pictures, strict=True)
+    ]
+    write_views(folder, views, (), paper_files=settings.draw.paper_files)
 
 
 def claim_views(mesh: Path, out: Path, settings: Settings, overwrite: bool) -> list[Path]:
@@ -85,12 +114,21 @@ def files_of_views(settings: Settings) -> list[str]:
     return file_names([camera.name for camera in cameras], settings.draw.paper_files)
 
 
+LIT = (
+    "The folder of the pictures has lights.json: they show its light and shadow, which the albedo now holds. "
+    "`mistyle fit` separates light from albedo; `mistyle render --unlit` draws views without light."
+)
+
+
 def bake_views(
     mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
-    """`mistyle bake`: project pictures of known cameras onto the texture (section 4.1.4)."""
+    """`mistyle bake`: project pictures of known cameras onto the texture (section 4.1.4).
+
+    The pictures' colours become the albedo as they are; a note names light that they are known to show.
+    """
     from mistyle.deliver.asset import asset_names
-    from mistyle.io.cameras.views import read_views, view_cameras
+    from mistyle.io.cameras.views import is_lit, read_views, view_cameras
 
     inputs = claim_baked(mesh, views, out, name, overwrite)
     sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]
@@ -102,6 +140,7 @@ def bake_views(
         progress.note(*asset.source.notes)
         look_again(*size_of(asset))
         pictures = read_views(views)
+        progress.note(*([LIT] if is_lit(views) else []))
         tell_views(asset.mesh, pictures, progress)
         seen_by = with_geometry(asset, pictures)
         shares: list[float] = []

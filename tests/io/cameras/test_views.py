@@ -289,3 +289,22 @@ def test_lights_json(tmp_path: Path, views: list[View]) -> None:
 def test_bad_lights_are_refused_with_the_reason(entry: dict, reason: str) -> None:
     with pytest.raises(InputRefused, match=reason):
         from_json({"lights": [entry]})
+
+
+@pytest.mark.parametrize(
+    ("text", "lit"),
+    [
+        (None, False),
+        ('{"lights": []}', False),
+        ('{"lights": [{"type": "ambient", "radiance": [1, 1, 1]}]}', True),
+        ('{"views": {"front": [{"type": "ambient", "radiance": [1, 1, 1]}]}}', True),
+        ("[3]", False),
+        ("torn", False),
+    ],
+)
+def test_a_folder_with_lights_is_lit(text, lit, tmp_path):
+    from mistyle.io.cameras.views import is_lit
+
+    if text is not None:
+        (tmp_path / "lights.json").write_text(text)
+    assert is_lit(tmp_path) == lit

@@ -165,6 +165,51 @@ def test_instances_share_new_uvs(tmp_path: Path) -> None:
     assert np.array_equal(uvs[:2][:, [0, 2, 1]], uvs[4:])  # vertex by vertex the same, in the turned winding
 
 
+def instanced(counts: list[int]) -> File:
+    """Nodes with so many instances of the square each, and a plain one."""
+    file = square()
+    for count in counts:
+        places = file.accessor(np.arange(3 * count, dtype=np.float32).reshape(-1, 3))
+        extension = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": places}}}
+        file.tree["nodes"].append({"mesh": 0, "extensions": extension})
+    file.tree["nodes"].append(file.tree["nodes"].pop(0))
+    file.tree["scenes"][0]["nodes"] = list(range(len(file.tree["nodes"])))
+    file.tree["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
+    return file
+
+
+@pytest.mark.parametrize(
+    ("counts", "most", "read"),
+    [
+        ([10], 100, [10]),
+        ([10], 22, [10]),  # 2 faces each, and 2 of the plain node
+        ([10], 21, [9]),
+        ([10], 3, [1]),
+        ([6, 6], 20, [6, 3]),
+        ([6, 6], 12, [4, 1]),  # the later nodes' first instances have their room
+    ],
+)
+def test_as_many_instances_are_read_as_fit(counts: list[int], most: int, read: list[int], tmp_path: Path) -> None:
+    path = instanced(counts).save(tmp_path / "a.gltf")
+    if most < 4:
+        with pytest.raises(InputRefused, match="at most 3"):
+            read_gltf(path, most)
+        return
+    raw = read_gltf(path, most).raw
+    assert [sum(p.node == k for p in raw.primitives) for k in range(len(counts) + 1)] == [*read, 1]
+    told = [f"Only the first {k} of {n} instances" for n, k in zip(counts, read, strict=True) if k < n]
+    notes = [note for note in raw.notes if "instances (" in note]
+    assert [any(note.startswith(text) for note in notes) for text in told] == [True] * len(told) and (
+        len(notes) == len(told) and all("read.max_faces" in note and "of a mesh with 2 faces" in note for note in notes)
+    )
+
+
+def test_the_fixed_limit_of_instances_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mistyle.io.gltf.read.MAX_INSTANCED", 8)
+    raw = read_gltf(instanced([10]).save(tmp_path / "a.gltf"), 1000).raw
+    assert len(raw.faces) == 10 and any("up to 8 faces of the scene (a fixed limit)" in note for note in raw.notes)
+
+
 @pytest.mark.parametrize(
     ("mode", "index", "faces"),
     [

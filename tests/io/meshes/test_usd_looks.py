@@ -344,3 +344,115 @@ def test_a_mesh_without_any_colour_is_noted_as_white(tmp_path: Path) -> None:
         path.write_text("#usda 1.0\n" + plate(extra))
         notes = read_usd(path, 100).notes
         assert any("neither a material nor a display colour" in note for note in notes) == noted
+
+
+def subset(name: str, face: int, bound: str) -> str:
+    return (
+        f'    def GeomSubset "{name}" ( {API} )\n    {{\n        uniform token elementType = "face"\n'
+        f'        uniform token familyName = "materialBind"\n        int[] indices = [{face}]\n'
+        f"        rel material:binding = <{bound}>\n    }}\n"
+    )
+
+
+def two_plates(extra: str) -> str:
+    """Two quads, one above the other, as one mesh."""
+    points = [(x, y, z) for z in (0, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    return (
+        f'def Mesh "Q" ( {API} )\n{{\n    int[] faceVertexCounts = [4, 4]\n'
+        f"    int[] faceVertexIndices = [0, 1, 2, 3, 4, 5, 6, 7]\n    point3f[] points = {points}\n"
+        f'    uniform token subdivisionScheme = "none"\n'
+        f"{primvar('st', 'texCoord2f', np.r_[UVS, UVS] / 4, 'vertex')}{extra}}}\n"
+    )
+
+
+MISSING = "bound materials are missing on the stage: /Materials/front, /Materials/back"
+
+
+def test_materials_of_another_layer_keep_their_slots(tmp_path: Path) -> None:
+    family = '    uniform token subsetFamily:materialBind:familyType = "partition"\n'
+    parts = subset("f", 0, "/Materials/front") + subset("b", 1, "/Materials/back")
+    found = read(tmp_path, two_plates(family + parts))
+    assert [m.name for m in found.materials] == ["front", "back"] and found.material.tolist() == [0, 0, 1, 1]
+    (note,) = (n for n in found.notes if "missing" in n)
+    assert MISSING in note
+    assert not any("neither a material" in n for n in found.notes)
+
+
+def test_a_mesh_of_a_missing_material_has_its_name(tmp_path: Path) -> None:
+    found = read(tmp_path, plate("    rel material:binding = </Materials/paint>\n"))
+    assert [m.name for m in found.materials] == ["paint"]
+    assert any(n.startswith("A bound material is missing on the stage: /Materials/paint.") for n in found.notes)
+    # Inherited, with the display colour of the mesh.
+    above = '    rel material:binding = </Materials/paint>\n    uniform token purpose = "default"\n'
+    colour = primvar("displayColor", "color3f", COLOURS[:1], "constant")
+    group = f'def Xform "G" ( {API} )\n{{\n{above}{plate(colour)}}}\n'
+    (material_found,) = read(tmp_path, group).materials
+    assert (material_found.name, material_found.albedo_factor) == ("paint", (1, 0, 0))
+
+
+def test_a_look_binds_the_subsets_of_the_source(tmp_path: Path) -> None:
+    from mistyle.io.materialx import TexturedMaterial
+    from mistyle.io.usd.look import write_look
+    from mistyle.io.usd.write import complaints
+
+    parts = subset("f", 0, "/Materials/front") + subset("b", 1, "/Materials/back")
+    path = write(tmp_path, two_plates(parts))
+    asset = read_mesh(path, uv="keep", size=16)
+    looks = [TexturedMaterial(p, f"{p}_a.png", f"{p}_n.png", f"{p}_r.png", f"{p}_m.png") for p in asset.mesh.parts]
+    for part in asset.mesh.parts:
+        for k in "anrm":
+            Image.new("RGB", (2, 2)).save(tmp_path / f"{part}_{k}.png")
+    layer = tmp_path / "look.usda"
+    write_look(layer, None, asset, looks, "wave", beside=tmp_path)
+    assert "active = false" not in layer.read_text() and complaints(layer) == []
+    stage = pxr.Usd.Stage.Open(str(layer))
+    api = pxr.UsdShade.MaterialBindingAPI
+    bound = {
+        s.GetPrim().GetName(): str(api(s.GetPrim()).ComputeBoundMaterial()[0].GetPath())
+        for s in api(stage.GetPrimAtPath("/R/Q")).GetMaterialBindSubsets()
+    }
+    assert bound == {"f": "/R/look/front", "b": "/R/look/back"}
+
+
+MOVES = (
+    "    double3 xformOp:translate.timeSamples = { 1: (0, 0, 0), 24: (0, 1, 0) }\n"
+    '    uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+)
+VARIANTS = 'def Xform "V" ( variants = { string finish = "a" }\n    prepend variantSets = "finish" )\n'
+VARIANTS += '{\n    variantSet "finish" = { "a" { } "b" { } }\n}\n'
+
+
+@pytest.mark.parametrize(
+    ("extra", "around", "held"),
+    [
+        ("", "", None),
+        (MOVES, "", "an animation (moving prims: 1)"),
+        ("", 'def Camera "C" {}\ndef Camera "D" {}\ndef SphereLight "L" {}\n', "cameras (2) and lights (1)"),
+        ("", VARIANTS, "further variants of 'finish'"),
+    ],
+)
+def test_contents_that_stay_in_the_file_are_noted(extra: str, around: str, held: str | None, tmp_path: Path) -> None:
+    from mistyle.deliver.losses import source_losses
+
+    notes = read(tmp_path, plate(extra), around).notes
+    sentences = source_losses(notes, ["glb", "usd", "obj", "maps"])
+    assert sentences == (() if held is None else (f"GLB and OBJ lack {held}, which the USD source has.",))
+    assert source_losses(notes, ["usd", "maps"]) == ()
+
+
+def test_a_skin_and_its_animation_are_noted(tmp_path: Path) -> None:
+    rig = 'def Skeleton "S" {}\ndef SkelAnimation "A"\n{\n    float3[] translations.timeSamples = '
+    rig += "{ 1: [(0, 0, 0)], 2: [(0, 1, 0)] }\n}\n"
+    binding = f'def Mesh "W" ( prepend apiSchemas = ["SkelBindingAPI"] )\n{{\n{ST}}}\ndef BlendShape "B" {{}}\n'
+    held = "a skin and its skeleton, blend shapes (1) and an animation (moving skeletons: 1)"
+    assert f"The USD file has {held}, which the asset lacks." in read(tmp_path, plate(""), rig, binding).notes
+
+
+def test_an_object_has_the_last_part_of_its_path(tmp_path: Path) -> None:
+    from mistyle.io.meshes.objects import objects
+
+    second = f'def Xform "G"\n{{\n{plate("")}}}\n'
+    asset = read_mesh(write(tmp_path, plate(""), second), uv="auto", size=16)
+    number, names = objects(asset)
+    assert names == ["Q", "Q_2"] and number.tolist() == [0, 0, 1, 1]
+    assert [p.name for p in asset.source.primitives] == ["/R/Q", "/R/G/Q"]

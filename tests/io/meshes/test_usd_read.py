@@ -441,9 +441,11 @@ def test_a_look_layer_holds_a_variant_per_style_over_the_untouched_source(tmp_pa
         found = opened(layer, variant)
         mesh_prim = found.GetPrimAtPath("/Root/Plate")
         subsets = UsdShade.MaterialBindingAPI(mesh_prim).GetMaterialBindSubsets()
-        assert [len(s.GetIndicesAttr().Get()) for s in subsets] == [1, 1]
-        for subset in subsets:
-            material = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
+        # The source's own subset and the mesh are bound: no subset is switched off, none is added.
+        assert [(s.GetPrim().GetName(), len(s.GetIndicesAttr().Get())) for s in subsets] == [("top", 1)]
+        bound = [UsdShade.MaterialBindingAPI(p).ComputeBoundMaterial()[0] for p in (mesh_prim, subsets[0].GetPrim())]
+        assert bound[0].GetPath() != bound[1].GetPath()
+        for material in bound:
             assert str(material.GetPath()).startswith("/Root/look/")
             texture = found.GetPrimAtPath(f"{material.GetPath()}/diffuseColor").GetAttribute("inputs:file").Get()
             assert texture.resolvedPath.endswith(f".{ending}") and Path(texture.resolvedPath).is_file()
