@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.rows import distinct_integers
 from mistyle.geometry.raster import fragments
 
 # UVs are float32: a coordinate this close to a tile's border lies on it.
@@ -172,7 +173,6 @@ def judge(points: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"], area:
     mirrored = float(np.abs(flat[flat < 0]).sum() / np.abs(flat).sum())
     distinct_faces = _first_of_twins(points, uvs)
     face, texel = fragments(uvs[distinct_faces].astype(np.float64) * RASTER, RASTER)
-    # Counted, not np.unique, whose hashing of consecutive numbers takes a second.
     covered = np.count_nonzero(np.bincount(texel, minlength=RASTER**2))
     coverage = covered / RASTER**2
     overlap, shared = _overlaps(points[distinct_faces], uvs[distinct_faces], face, texel)
@@ -205,7 +205,8 @@ def _overlaps(
     if not several.any():
         return 0.0, 0.0
     island = islands(points, uvs)
-    order = np.lexsort((face[several], island[face[several]], texel[several]))
+    # By texel, island and face: fragments come in face order.
+    order = np.argsort(texel[several] * (int(island.max()) + 1) + island[face[several]], kind="stable")
     f, t = face[several][order], texel[several][order]
     same = t[1:] == t[:-1]
     first, second, where = f[:-1][same], f[1:][same], t[1:][same]
@@ -213,7 +214,7 @@ def _overlaps(
     fine = intended[first] & intended[second] & (first != second)
     a, b = island[first], island[second]
     fine |= (a != b) & _coincident(a, b, island[face], texel)
-    bad = len(np.unique(where[~fine]))
+    bad = np.count_nonzero(np.bincount(where[~fine], minlength=1))
     all_shared = np.count_nonzero(counts > 1)
     return bad / covered, (all_shared - bad) / covered
 
@@ -222,7 +223,7 @@ def _coincident(
     a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"], island: Int[np.ndarray, " n"], texel: Int[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " p"]:
     """Whether the two islands of each overlap cover (nearly) the same texels."""
-    size = np.bincount(np.unique(island * (RASTER * RASTER) + texel) // (RASTER * RASTER))
+    size = np.bincount(distinct_integers(island * (RASTER * RASTER) + texel) // (RASTER * RASTER))
     pair = group_rows(a, b)
     common = np.bincount(pair)[pair]
     return common >= COINCIDE * np.maximum(size[a], size[b])
