@@ -214,6 +214,8 @@ def _plan(
         notes.append(f"Material '{name}' was unwrapped anew, as requested.")
         return _Plan(rows, None, "requested")
     layout, reason = _layout(raw, raw.uvs, rows, points, area)
+    if raw.materials[material].udim and layout is not None:
+        notes.extend(_tile_notes(name, layout, bool(reason) and uv != "keep"))
     if reason and raw.authored is not None:
         authored_layout, refusal = _layout(raw, raw.authored, rows, points, area)
         if not refusal and authored_layout is not None:
@@ -282,6 +284,27 @@ def _add_notes(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes:
         )
     if mirrored > 0.005:
         notes.append(f"{mirrored:.0%} of the UV area of material '{name}' is mirrored; it was kept as authored.")
+
+
+def _tile_notes(name: str, layout: Layout, unwrapped: bool) -> list[str]:
+    """Sentences about faces that do not lie inside one tile of a material whose textures are tiles."""
+    count, tiled = len(layout.tile), (layout.tile != 1001).any()
+    if unwrapped and tiled:
+        return [f"The textures of material '{name}' are tiles; after its unwrapping only tile 1001 is shown."]
+    if layout.astray and not tiled:
+        return [
+            f"{layout.astray} of {count} faces of material '{name}' lie in no UDIM tile (u 0..10, v 0..10); all faces "
+            "show the texture of tile 1001."
+        ]
+    notes = []
+    if layout.beyond:
+        notes.append(
+            f"{layout.beyond} of {count} faces of material '{name}' reach beyond their UDIM tile; there its texture "
+            "repeats."
+        )
+    if layout.astray:
+        notes.append(f"{layout.astray} faces of material '{name}' lie in no UDIM tile; they show the nearest tile.")
+    return notes
 
 
 def _unwrap(
