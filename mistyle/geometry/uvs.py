@@ -146,8 +146,8 @@ def nearest_tiles(
     lo, hi = island_boxes(uvs, island)
     tile = np.floor((lo + hi) / 2)
     low, high = uvs.min(axis=1).astype(np.float64), uvs.max(axis=1).astype(np.float64)
-    whole = (np.maximum(tile - lo, hi - tile - 1) <= SPILL).all(axis=1)
-    tile = np.where(whole[island][:, None], tile[island], np.floor((low + high) / 2)).astype(np.int64)
+    whole = np.maximum(tile - lo, hi - tile - 1).max(axis=1) <= SPILL
+    tile = np.where(whole[island, None], tile[island], np.floor((low + high) / 2)).astype(np.int64)
     nearest = np.clip(tile, 0, 9)
     return nearest, (nearest != tile).any(axis=1)
 

@@ -1,11 +1,13 @@
 """What was left out, guessed or repaired is said: on the console, in --json, in run.json and in the report."""
 
 import json
+import time
 from types import SimpleNamespace
 
 import pytest
 
 from mistyle.cli.main import main
+from mistyle.jobs import progress as jobs_progress
 from mistyle.jobs.progress import Progress, grouped
 from mistyle.stylization.optimise.judge import TOLERANCE, regressed, undone_where
 from mistyle.stylization.report import summary
@@ -83,3 +85,15 @@ def test_a_kept_phase_says_what_got_worse_within_the_tolerance():
     judged.figures["phase1.detail"] = (0.88, 0.90)
     assert dict(fit_facts(judged))["phase1"] == "kept; no figure got worse"
     assert dict(fit_facts(SimpleNamespace(kept={"phase1": True}, figures={})))["phase1"] == "kept, not judged"
+
+
+def test_a_silent_stage_shows_that_it_goes_on():
+    said = []
+    with jobs_progress._signs_of_life("read the asset", said.append, every=0.1) as say:
+        say("first")
+        time.sleep(0.5)
+    assert said[0] == "first" and 1 <= len(said) - 1 <= 4
+    assert all(line == "  read the asset: 0 s so far" for line in said[1:])
+    count = len(said)
+    time.sleep(0.2)
+    assert len(said) == count

@@ -264,10 +264,8 @@ def _one_colour_a_texel(raw: Raw, own: Int[np.ndarray, " n"], layout: Layout) ->
         low, high = np.full((size**2, 3), np.inf), np.full((size**2, 3), -np.inf)
         np.minimum.at(low, texel, at)
         np.maximum.at(high, texel, at)
-        covered, torn = (
-            covered + np.count_nonzero(np.bincount(texel)),
-            torn + int(((high - low).max(axis=1) > MAX_TORN).sum()),
-        )
+        covered += int(np.count_nonzero(np.bincount(texel)))
+        torn += int(((high - low).max(axis=1) > MAX_TORN).sum())
     return torn <= 0.01 * covered
 
 

@@ -204,6 +204,18 @@ def test_udim_textures(tmp_path: Path) -> None:
     assert asset.mesh.corner_uvs[2:].min() == pytest.approx(0.1, abs=1e-6)
 
 
+def test_each_material_moves_the_progress(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(SQUARE + "".join(f"usemtl m{k}\nf 1/1 2/2 3/3\n" for k in range(8)))
+    done: list[float] = []
+    read_mesh(path, progress=done.append)
+    assert done == sorted(done) and done[-1] == pytest.approx(1) and len(done) >= 16
+    assert max(np.diff([0, *done])) < 0.16
+    done.clear()
+    read_mesh(path, uv="new", progress=done.append)
+    assert done == sorted(done) and done[-1] == pytest.approx(1)
+
+
 @pytest.mark.parametrize(
     ("left", "parts", "note"),
     [
