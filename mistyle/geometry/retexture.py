@@ -13,6 +13,7 @@ from mistyle.geometry.uvs import signed_areas
 Wrap = Literal["repeat", "mirror", "clamp"]
 Wraps = tuple[Wrap, Wrap]  # along u and along v
 REPEAT: Wraps = ("repeat", "repeat")
+Covered = tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]
 
 
 def carry(
@@ -21,15 +22,16 @@ def carry(
     uvs: Float[np.ndarray, "f 3 2"],
     size: int,
     wrap: Wraps = REPEAT,
+    covered: Covered | None = None,
 ) -> tuple[np.ndarray, Int[np.ndarray, "h w"]]:
     """A texture of size² for `uvs` that equals `values` at `lookup` on every face, and each texel's face.
 
     Both UVs are v up, row 0 is v = 1; the new texture repeats, the old one wraps by `wrap`. Sampled bilinearly at
     texel centres; the first of several faces at a texel counts; texels without a face (face -1) take their
-    nearest covered neighbour.
+    nearest covered neighbour. `covered` is `covered_texels(uvs, size)` where the caller has it already.
     """
     channels = values if values.ndim == 3 else values[..., None]
-    pieces, face, weights = covered_texels(uvs, size)
+    pieces, face, weights = covered_texels(uvs, size) if covered is None else covered
     at = np.einsum("nk,nkc->nc", weights, lookup[face].astype(np.float64))
     result, faces = _filled(pieces, face, fetch(channels, at, wrap), size)
     return (result if values.ndim == 3 else result[..., 0]), faces
@@ -46,9 +48,7 @@ def carry_corners(
     )[0]
 
 
-def covered_texels(
-    uvs: Float[np.ndarray, "f 3 2"], size: int
-) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+def covered_texels(uvs: Float[np.ndarray, "f 3 2"], size: int) -> Covered:
     """The texels (row * size + column) whose centres a face covers, the first such face, and the centre's barycentric
     coordinates in it. UVs are v up and repeat."""
     spot = uvs.astype(np.float64) * [size, -size] + [0, size]  # y grows with the row
@@ -78,8 +78,9 @@ def texel_weights(
 ) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of a texel's centre in the triangle that covers it, in any tile."""
     centre = np.stack([texel % size, texel // size], axis=1) + 0.5
-    centre += np.ceil((spot.min(axis=1) - centre) / size) * size  # the copy inside the triangle's box
     a, b, c = spot[:, 0], spot[:, 1], spot[:, 2]
+    lowest = np.minimum(np.minimum(a, b), c)
+    centre += np.ceil((lowest - centre) / size) * size  # the copy inside the triangle's box
     area = _cross(b - a, c - a)
     area = np.where(area == 0, 1, area)
     w0, w1 = _cross(b - centre, c - centre) / area, _cross(c - centre, a - centre) / area

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.mesh import Mesh, weld
-from mistyle.core.rows import sums
+from mistyle.core.rows import distinct_integers, sums
 
 _TINY = np.finfo(np.float32).tiny
 
@@ -167,7 +167,7 @@ def _join_silent(vertex, links, frames: _Frames, label: np.ndarray, positive: np
     the reference's (faces and corners ascending). Changes `label` and `positive` of these corners in place.
     """
     silent = frames.silent
-    touched = np.isin(vertex, np.unique(vertex.reshape(-1, 3)[silent]))
+    touched = np.isin(vertex, distinct_integers(vertex.reshape(-1, 3)[silent]))
     near: dict[int, list[int]] = {}
     for a, b in links[touched[links[:, 0]]].tolist():
         near.setdefault(a, []).append(b)

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.paths import PACKAGE
+from mistyle.core.rows import distinct_integers
 from mistyle.geometry import decimated as proxy
 from mistyle.geometry.normals import area_vectors, same_points
 from mistyle.geometry.uvs import group_rows
@@ -79,7 +80,7 @@ def _clean(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     xatlas ends charts at edges with more than two faces, so a double-sided model would fall into single triangles; and
     it drops faces of less than 1e-7 units².
     """
-    used = np.unique(faces)
+    used = distinct_integers(faces)
     points = same_points(positions[used])
     lookup = np.zeros(len(positions), np.int64)
     lookup[used] = points

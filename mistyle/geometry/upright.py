@@ -4,6 +4,7 @@ on several of its sides, or on none, gives no decision."""
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.rows import distinct_integers
 from mistyle.geometry.normals import area_vectors
 
 CONTACT = 0.01  # points this close to the lowest one touch the ground, in shares of the height
@@ -34,7 +35,7 @@ def lies_on_its_side(positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray,
     """Whether Z clearly points up: the form is tallest along z and stands on its lower z end, far worse on the upper
     one. It falls over on both ends of y and x."""
     weight = np.linalg.norm(area_vectors(positions, faces), axis=1)
-    used = positions[np.unique(faces[weight > 0])] if (weight > 0).any() else positions[:0]
+    used = positions[distinct_integers(faces[weight > 0])] if (weight > 0).any() else positions[:0]
     if len(used) < 4:
         return False
     size = np.ptp(used, axis=0)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.rows import distinct_integers
 from mistyle.geometry.raster import fragments
 
 # UVs are float32: a coordinate this close to a tile's border lies on it.
@@ -15,6 +16,7 @@ RASTER = 512
 MAX_DEGENERATE = 0.01  # share of the surface without UV area
 MAX_OVERLAP = 0.01  # share of covered texels with unintended overlaps
 MIN_COVERAGE = 0.002  # share of the square in use; colour-swatch UVs stay below it
+SPILL = 0.1  # of a UDIM tile, by which an island may leave the tile that it stays in as a whole
 COINCIDE = 0.97  # islands that cover each other this far coincide
 
 
@@ -34,11 +36,14 @@ class Verdict:
 @dataclass(frozen=True)
 class Layout:
     """UVs in working layout: whole faces moved by integers. `tile` is the UDIM tile of each face (1001 + u + 10 v),
-    1001 for all where the set is not tiled; `verdicts` has one entry per tile in ascending order."""
+    1001 for all where the set is not tiled; `verdicts` has one entry per tile in ascending order. `beyond` counts the
+    faces that reach beyond their tile, `astray` the faces that lie in no tile of a set whose textures are tiles."""
 
     uvs: Float[np.ndarray, "f 3 2"]
     tile: Int[np.ndarray, " f"]
     verdicts: tuple[Verdict, ...]
+    beyond: int = 0
+    astray: int = 0
 
     @property
     def usable(self) -> bool:
@@ -130,6 +135,23 @@ def tiles(uvs: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"]) -> Int
     return corner.astype(np.int64)[island]
 
 
+def nearest_tiles(
+    uvs: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"]
+) -> tuple[Int[np.ndarray, "f 2"], Bool[np.ndarray, " f"]]:
+    """The UDIM tile (u, v) in which every face lies mostly, in 0..9, and whether the face lies in no such tile.
+
+    An island that leaves the tile of its middle by SPILL at most stays whole; the faces of others go by their own
+    middle. Faces in no tile get the nearest.
+    """
+    lo, hi = island_boxes(uvs, island)
+    tile = np.floor((lo + hi) / 2)
+    low, high = uvs.min(axis=1).astype(np.float64), uvs.max(axis=1).astype(np.float64)
+    whole = np.maximum(tile - lo, hi - tile - 1).max(axis=1) <= SPILL
+    tile = np.where(whole[island, None], tile[island], np.floor((low + high) / 2)).astype(np.int64)
+    nearest = np.clip(tile, 0, 9)
+    return nearest, (nearest != tile).any(axis=1)
+
+
 def arrange(
     points: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"], area: Float[np.ndarray, " f"], udim: bool | None
 ) -> Layout:
@@ -137,7 +159,8 @@ def arrange(
 
     `area` is each face's area in space. `udim`: True when the material's textures are named as tiles, False when one
     texture repeats over every tile, None when unknown. Then islands in several tiles count as a UDIM layout,
-    unless they coincide exactly in the square (shells moved one tile away to share texels).
+    unless they coincide exactly in the square (shells moved one tile away to share texels). Named tiles hold unless
+    most of the area lies in none of them.
     """
     single = np.full(len(uvs), 1001)
     if not np.isfinite(uvs).all():
@@ -145,18 +168,23 @@ def arrange(
     if np.abs(uvs).max(initial=0) > 1e4:
         return Layout(uvs, single, (Verdict(False, "UVs reach further than 10000 tiles"),))
     island = islands(points, uvs)
-    tile = None if udim is False else tiles(uvs, island)
-    if tile is not None and len(np.unique(tile, axis=0)) > 1:
+    tile, astray = None if udim is False else tiles(uvs, island), 0
+    if tile is None and udim:
+        tile, outside = nearest_tiles(uvs, island)
+        astray = int(outside.sum())
+        tile = None if area[outside].sum() > area.sum() / 2 else tile
+    if tile is not None and (udim or len(np.unique(tile, axis=0)) > 1):
         number = 1001 + tile[:, 0] + 10 * tile[:, 1]
         moved = _moved(uvs, tile.astype(np.float64))
         merged = None if udim else judge(points, moved, area)
         if merged is None or not merged.usable or merged.shared == 0:
             numbers = np.unique(number)
             verdicts = tuple(judge(points[number == n], moved[number == n], area[number == n]) for n in numbers)
-            return Layout(moved, number, verdicts)
+            beyond = ((moved.min(axis=1) < -BORDER) | (moved.max(axis=1) > 1 + BORDER)).any(axis=1)
+            return Layout(moved, number, verdicts, int(beyond.sum()), astray)
         return Layout(moved, single, (merged,))
     moved = shift(uvs, island)
-    return Layout(moved, single, (judge(points, moved, area),))
+    return Layout(moved, single, (judge(points, moved, area),), astray=astray)
 
 
 def judge(points: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"], area: Float[np.ndarray, " f"]) -> Verdict:
@@ -172,7 +200,6 @@ def judge(points: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"], area:
     mirrored = float(np.abs(flat[flat < 0]).sum() / np.abs(flat).sum())
     distinct_faces = _first_of_twins(points, uvs)
     face, texel = fragments(uvs[distinct_faces].astype(np.float64) * RASTER, RASTER)
-    # Counted, not np.unique, whose hashing of consecutive numbers takes a second.
     covered = np.count_nonzero(np.bincount(texel, minlength=RASTER**2))
     coverage = covered / RASTER**2
     overlap, shared = _overlaps(points[distinct_faces], uvs[distinct_faces], face, texel)
@@ -205,7 +232,8 @@ def _overlaps(
     if not several.any():
         return 0.0, 0.0
     island = islands(points, uvs)
-    order = np.lexsort((face[several], island[face[several]], texel[several]))
+    # By texel, island and face: fragments come in face order.
+    order = np.argsort(texel[several] * (int(island.max()) + 1) + island[face[several]], kind="stable")
     f, t = face[several][order], texel[several][order]
     same = t[1:] == t[:-1]
     first, second, where = f[:-1][same], f[1:][same], t[1:][same]
@@ -213,7 +241,7 @@ def _overlaps(
     fine = intended[first] & intended[second] & (first != second)
     a, b = island[first], island[second]
     fine |= (a != b) & _coincident(a, b, island[face], texel)
-    bad = len(np.unique(where[~fine]))
+    bad = np.count_nonzero(np.bincount(where[~fine], minlength=1))
     all_shared = np.count_nonzero(counts > 1)
     return bad / covered, (all_shared - bad) / covered
 
@@ -222,7 +250,7 @@ def _coincident(
     a: Int[np.ndarray, " p"], b: Int[np.ndarray, " p"], island: Int[np.ndarray, " n"], texel: Int[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " p"]:
     """Whether the two islands of each overlap cover (nearly) the same texels."""
-    size = np.bincount(np.unique(island * (RASTER * RASTER) + texel) // (RASTER * RASTER))
+    size = np.bincount(distinct_integers(island * (RASTER * RASTER) + texel) // (RASTER * RASTER))
     pair = group_rows(a, b)
     common = np.bincount(pair)[pair]
     return common >= COINCIDE * np.maximum(size[a], size[b])

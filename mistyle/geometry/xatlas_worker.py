@@ -4,12 +4,14 @@ xatlas reports no progress, cannot be interrupted and may abort the process on b
 main process: `python -m mistyle.geometry.xatlas_worker IN.npz OUT.npz`.
 """
 
+import os
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.rows import distinct
+from mistyle.core.rows import distinct, distinct_integers
 from mistyle.geometry.raster import fragments
 from mistyle.geometry.uvs import signed_areas
 from mistyle.process.children import end_with_parent
@@ -25,6 +27,8 @@ MIN_PADDING = 2
 MAX_SHRINK = 0.7
 OVERLAP_TEXELS = 2_000_000
 CHART_TEXELS = 100_000
+MOST_THREADS = 4  # each takes some 0.3 GB
+MOST_CELLS = 4 * OVERLAP_TEXELS  # above this, covered texels are sorted instead of counted in the charts' boxes
 
 
 def run(source: str, target: str) -> None:
@@ -33,8 +37,8 @@ def run(source: str, target: str) -> None:
     with np.load(source, allow_pickle=False) as stored:
         data = {name: stored[name] for name in stored.files}
     resolution, padding = int(data["resolution"]), int(data["padding"])
-    result = {}
-    for i in range(int(data["count"])):
+
+    def unwrapped(i: int) -> tuple[np.ndarray, np.ndarray]:
         positions, faces = data[f"positions_{i}"], data[f"faces_{i}"]
         if f"uvs_{i}" in data:
             uvs, chart = data[f"uvs_{i}"], data[f"chart_{i}"]
@@ -43,7 +47,13 @@ def run(source: str, target: str) -> None:
         corners = positions[faces]
         uvs, chart = mend(uvs, chart, corners)
         chart = cut_overlaps(uvs, chart)
-        result[f"uvs_{i}"], result[f"chart_{i}"] = pack(landscape(uvs, chart), chart, resolution, padding), chart
+        return pack(landscape(uvs, chart), chart, resolution, padding), chart
+
+    result = {}
+    # xatlas and sorting release Python's lock. No mesh depends on another, so threads do not change the result.
+    with ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1)) as pool:
+        for i, (uvs, chart) in enumerate(pool.map(unwrapped, range(int(data["count"])))):
+            result[f"uvs_{i}"], result[f"chart_{i}"] = uvs, chart
     np.savez(target, **result)
 
 
@@ -157,7 +167,7 @@ def cut_overlaps(uvs: Float[np.ndarray, "f 3 2"], chart: Int[np.ndarray, " f"]) 
             face, texel = fragments(flat * scale, 1 << 20, wrap=False)
             order = np.lexsort((steps[face], texel))
             again = np.concatenate([[False], texel[order][1:] == texel[order][:-1]])
-            chart[faces[np.unique(face[order][again])]] = chart.max() + 1
+            chart[faces[distinct_integers(face[order][again])]] = chart.max() + 1
     return chart
 
 
@@ -189,15 +199,27 @@ def _folded_charts(uvs: Float[np.ndarray, "f 3 2"], chart: Int[np.ndarray, " f"]
     scale = np.sqrt(OVERLAP_TEXELS / np.abs(signed_areas(uvs[order])).sum())
     size = 1 << 20
     face, texel = fragments((uvs[order] - origin[which][:, None]) * scale, size, wrap=False)
-    # Texels of different charts are distinct: number them by chart as well (2^40 texels, 2^23 charts).
-    _, compact = np.unique(texel, return_inverse=True)
-    place = which[face] * (int(compact.max(initial=0)) + 1) + compact
-    unique, count = np.unique(place, return_counts=True)
-    of_chart = unique // (int(compact.max(initial=0)) + 1)
-    texels = np.bincount(of_chart, minlength=len(starts))
-    double = np.bincount(of_chart[count > 1], minlength=len(starts))
+    high = np.maximum.reduceat(uvs[order].max(axis=1), starts)
+    sides = np.minimum(np.ceil((high - origin) * scale) + 1, size)
+    texels, double = _covered_texels(which[face], texel % size, texel // size, sides)
     members = np.bincount(which, minlength=len(starts))
     return chart[order[starts]][(double > np.maximum(2, texels / 1000)) & (members > 1)]
+
+
+def _covered_texels(
+    chart: Int[np.ndarray, " n"], column: Int[np.ndarray, " n"], row: Int[np.ndarray, " n"], sides: np.ndarray
+) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
+    """How many texels each chart covers, and how many of them at least twice. `sides` (c, 2) are the width and height
+    of the charts' boxes in texels, which begin at 0."""
+    cells = sides[:, 0] * sides[:, 1]
+    if cells.sum() > MOST_CELLS:  # Long slanted charts: sorted by chart (2^23), row and column (2^20 each).
+        place, count = np.unique((chart << 40) + (row << 20) + column, return_counts=True)
+        owner = place >> 40
+        return np.bincount(owner, minlength=len(sides)), np.bincount(owner[count > 1], minlength=len(sides))
+    begin = np.concatenate([[0], np.cumsum(cells[:-1])]).astype(np.int64)
+    width = sides[:, 0].astype(np.int64)
+    count = np.bincount(begin[chart] + row * width[chart] + column, minlength=int(cells.sum()))
+    return np.add.reduceat(count > 0, begin, dtype=np.int64), np.add.reduceat(count > 1, begin, dtype=np.int64)
 
 
 def pack(

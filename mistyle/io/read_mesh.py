@@ -61,7 +61,7 @@ def read_mesh(
     max_faces refuses larger meshes (and more than three times as many vertices)
     size      the atlas size for the padding of a new unwrapping
     lit       a glTF result drops KHR_materials_unlit from its painted materials
-    progress  receives the share done, 0..1; reading takes the first tenth, unwrapping most of the rest
+    progress  receives the share done, 0..1, after each material's UVs, while unwrapping and after each material's maps
 
     OBJ, PLY, STL, OFF, GLB, glTF and USD, each without merging or reordering vertices (STL, which repeats them, is
     welded, with a note). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees

@@ -1,6 +1,7 @@
 """Progress of a job on stderr: bars with the remaining time on a terminal, plain lines elsewhere."""
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from itertools import accumulate
 from mistyle.process import memory
 
 Report = Callable[[float], None]
+EVERY = 15.0  # seconds between lines
 
 
 class Progress:
@@ -48,7 +50,8 @@ class Progress:
                     yield report
             else:
                 self.say(f"{what} ...")
-                yield _lines(what, self.say)
+                with _signs_of_life(what, self.say) as say:
+                    yield _lines(what, say)
             self.peaks[name] = most() / 1e9
         self.seconds[name] = time.perf_counter() - start
         self.say(f"{what}: {self.seconds[name]:.1f} s")
@@ -156,7 +159,31 @@ def _bar(what: str) -> Iterator[StageReport]:
         yield StageReport(show)
 
 
-def _lines(what: str, say: Callable[[str], None], every: float = 20.0) -> StageReport:
+@contextmanager
+def _signs_of_life(what: str, say: Callable[[str], None], every: float = EVERY + 3) -> Iterator[Callable[[str], None]]:
+    """Yields `say`; a line with the seconds so far follows wherever nothing was said for `every` seconds."""
+    began, ended = time.perf_counter(), threading.Event()
+    last = [began]
+
+    def spoken(text: str) -> None:
+        last[0] = time.perf_counter()
+        say(text)
+
+    def watch() -> None:
+        while not ended.wait(every / 10):
+            if time.perf_counter() - last[0] >= every:
+                spoken(f"  {what}: {time.perf_counter() - began:.0f} s so far")
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield spoken
+    finally:
+        ended.set()
+        thread.join()
+
+
+def _lines(what: str, say: Callable[[str], None], every: float = EVERY) -> StageReport:
     """A progress line every `every` seconds: logs of a farm stay short."""
     last = [time.perf_counter()]
 

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.atlas.neighbours import Links, within
+from mistyle.core.rows import distinct_integers
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
 from mistyle.solver.prior import METAL_SPREAD
 from mistyle.solver.schedule import WHOLE
@@ -178,7 +179,7 @@ def _seam_differences(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndar
     width, rows, firm = variance.shape[1], [], []
     grids = np.pad(among.right, ((0, 0), (0, 1))).ravel(), np.pad(among.below, ((0, 1), (0, 0))).ravel()
     for grid, step, sides in zip(grids, (1, width), (among.seams[:2], among.seams[2:]), strict=True):
-        at = np.unique(np.concatenate([seam.here for seam in sides]))
+        at = distinct_integers(np.concatenate([seam.here for seam in sides]))
         before = np.maximum(at - step, 0)
         beside = np.stack([np.where(grid[at], at + step, -1), np.where(grid[before] & (at >= step), before, -1)])
         share = np.ones(beside.shape, np.float32)

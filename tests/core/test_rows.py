@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mistyle.core.rows import distinct, evenly, weighted_medians
+from mistyle.core.rows import distinct, distinct_integers, evenly, weighted_medians
 
 
 @pytest.mark.parametrize("kind", [np.int32, np.int64, np.float64])
@@ -36,3 +36,14 @@ def test_weighted_medians_by_group():
 def test_rows_are_chosen_evenly():
     assert evenly(0, 4) == [] and evenly(1, 4) == [0] and evenly(3, 8) == [0, 1, 2]
     assert evenly(11, 4) == [0, 3, 7, 10] and len(evenly(100, 48)) == 48
+
+
+@pytest.mark.parametrize("values", [[], [3], [2, 2, 2], [5, -1, 5, 2**62, -1], [[4, 1], [1, 9]]])
+def test_distinct_integers_are_those_of_unique(values):
+    values = np.array(values, np.int64)
+    assert np.array_equal(distinct_integers(values), np.unique(values))
+
+
+def test_distinct_integers_of_many():
+    values = np.random.default_rng(0).integers(-(10**12), 10**12, 50_000) // 10**8
+    assert np.array_equal(distinct_integers(values), np.unique(values))

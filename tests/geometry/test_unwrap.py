@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from mistyle.core.errors import InputRefused
-from mistyle.geometry import decimated
+from mistyle.geometry import decimated, xatlas_worker
 from mistyle.geometry import unwrap as unwrapping
 from mistyle.geometry.normals import area_vectors, same_points
 from mistyle.geometry.raster import fragments
@@ -245,3 +245,18 @@ def test_carried_normals_point_the_same_way_in_space(mirrored: bool) -> None:
     expected = [tilt[0] * np.cos(turn), tilt[0] * np.sin(turn), 0.8]
     assert result[face >= 0] == pytest.approx(np.tile(expected, (3, 1)), abs=1e-5)
     assert result[1, 1] == pytest.approx(before, abs=1e-6)
+
+
+def test_texels_of_charts_are_counted_as_they_are_sorted(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chart, sides = rng.integers(0, 5, 4000), np.array([[9, 40], [40, 3], [1, 1], [20, 20], [5, 5]], float)
+    column, row = (rng.integers(0, sides[chart, k].astype(int)) for k in (0, 1))
+    used = chart != 2  # a chart that covers no texel
+    counted = xatlas_worker._covered_texels(chart[used], column[used], row[used], sides)
+    monkeypatch.setattr(xatlas_worker, "MOST_CELLS", 0)
+    for fast, plain in zip(
+        counted, xatlas_worker._covered_texels(chart[used], column[used], row[used], sides), strict=True
+    ):
+        np.testing.assert_array_equal(fast, plain)
+    assert counted[0][2] == 0 and (counted[1] > 0).sum() == 4

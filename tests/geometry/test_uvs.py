@@ -211,6 +211,46 @@ def test_islands_across_tile_borders_are_no_udim() -> None:
     assert tiles(uvs, islands(points, uvs)) is None
 
 
+@pytest.mark.parametrize("over", [(-0.04, 0), (0.04, 0), (0, -0.04), (0, 0.04), (-0.04, 0.04)])
+def test_an_island_a_little_beyond_a_named_tile_stays_in_it(over: tuple[float, float]) -> None:
+    """Over each border of tile 1012, also where its corners all lie beyond it."""
+    for size in (0.5, 1.06):
+        points, uvs, area = together(square(0.05, 0.9, 0), square(0.0, size, 10))
+        uvs[2:] += np.float32([1, 1]) + np.float32(over) + np.float32([0.5 * (k > 0) * (size < 1) for k in over])
+        assert tiles(uvs, islands(points, uvs)) is None
+        layout = arrange(points, uvs, area, True)
+        assert layout.tile.tolist() == [1001, 1001, 1012, 1012] and layout.beyond > 0 and layout.astray == 0
+        assert layout.uvs[2:] == pytest.approx(uvs[2:] - 1, abs=SHIFT_ROUNDING)
+        assert (arrange(points, uvs, area, None).tile == 1001).all()  # no textures that say so
+
+
+def test_named_tiles_hold_on_their_borders_and_for_a_single_tile() -> None:
+    points, uvs, area = together(square(0.0, 1.0, 0))
+    for tile in ((0, 0), (1, 0), (0, 1), (9, 9)):
+        layout = arrange(points, uvs + np.float32(tile), area, True)
+        assert (layout.tile == 1001 + tile[0] + 10 * tile[1]).all() and layout.beyond == layout.astray == 0
+        assert layout.usable and layout.uvs == pytest.approx(uvs, abs=SHIFT_ROUNDING)
+
+
+def test_the_faces_of_an_island_over_two_named_tiles_go_by_their_middles() -> None:
+    points, uvs = grid(8)
+    uvs = uvs * np.float32([2, 1])
+    layout = arrange(points, uvs, np.ones(len(uvs)), True)
+    assert np.array_equal(layout.tile, 1001 + (uvs[:, :, 0].mean(axis=1) > 1)) and layout.beyond == 0 and layout.usable
+    layout = arrange(points, uvs + np.float32([0.1, 0]), np.ones(len(uvs)), True)
+    assert set(layout.tile) == {1001, 1002} and 0 < layout.beyond < len(uvs)
+
+
+def test_faces_in_no_named_tile_are_counted() -> None:
+    points, uvs, area = together(square(0.1, 0.9, 0), square(0.1, 0.9, 10))
+    uvs[:2] -= np.float32([3, 0])
+    uvs[2:] += np.float32([1, 0])
+    layout = arrange(points, uvs, np.array([1.0, 1, 3, 3]), True)
+    assert layout.tile.tolist() == [1001, 1001, 1002, 1002] and layout.astray == 2
+    layout = arrange(points, uvs, np.array([3.0, 3, 1, 1]), True)
+    assert (layout.tile == 1001).all() and layout.astray == 2  # most of the area: the tiles are given up
+
+
 def test_missing_uvs_are_told() -> None:
     points, uvs, area = together(square(0, 1, 0))
     uvs[1, 0, 0] = np.nan

@@ -1,6 +1,7 @@
 """What was left out, guessed or repaired is said: on the console, in --json, in run.json and in the report."""
 
 import json
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from PIL import Image
 
 from mistyle.cli.main import main
+from mistyle.jobs import progress as jobs_progress
 from mistyle.jobs.progress import Progress, grouped
 from mistyle.stylization.optimise.judge import TOLERANCE, regressed, undone_where
 from mistyle.stylization.report import summary
@@ -121,3 +123,15 @@ def test_unlit_views_have_no_scene(tmp_path, capsys):
     scene.write_text('<scene version="3.0.0"/>')
     words = ["render", str(tmp_path / "a.obj"), "-o", str(tmp_path / "out"), "--unlit", "--scene", str(scene)]
     assert main(words) == 2 and "--unlit" in capsys.readouterr().err
+
+
+def test_a_silent_stage_shows_that_it_goes_on():
+    said = []
+    with jobs_progress._signs_of_life("read the asset", said.append, every=0.1) as say:
+        say("first")
+        time.sleep(0.5)
+    assert said[0] == "first" and 1 <= len(said) - 1 <= 4
+    assert all(line == "  read the asset: 0 s so far" for line in said[1:])
+    count = len(said)
+    time.sleep(0.2)
+    assert len(said) == count

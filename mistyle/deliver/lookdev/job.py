@@ -8,6 +8,7 @@ OUT/lookdev.json           asset, settings, exposures and versions of the sheet
 
 import datetime
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -94,17 +95,20 @@ def lookdev(
     inputs = [place, *([hdri] if hdri is not None else [])]
     claim(out, files_of_sheet(settings), inputs=inputs, overwrite=overwrite)
     start_engines(settings)
-    with progress.stage("read", "read the asset"):
-        subject = read_subject(place)
+    with progress.stage("read", "read the asset") as report:
+        subject = read_subject(place, report)
         sky = None if hdri is None else read_radiance(hdri)
     progress.note(*subject.asset.notes_of_pictures())
     with progress.stage("light", "expose the lights"):
         name = "" if hdri is None else hdri.stem
         lights = [drawing.exposed(rig, settings.seed) for rig in drawing.rigs(sky, name, read_radiance)]
+        # Kernels hold all materials that are loaded, so that the references come before the asset's.
+        scale = settings.size / USUAL
+        columns = [drawing.references(rig.light, settings.spp, settings.seed, scale) for rig in lights]
         stage = drawing.Stage(subject.asset)
     with progress.stage("sheet", "draw the sheet") as report:
         day = date or datetime.datetime.fromtimestamp(subject.path.stat().st_mtime, datetime.UTC).date().isoformat()
-        picture = compose(*sheet(subject, stage, lights, settings, day, report))
+        picture = compose(*sheet(subject, stage, list(zip(lights, columns, strict=True)), settings, day, report))
     written = {"sheet": "lookdev.png", "exr": "lookdev.exr"}
     record = {"asset": subject.path.name, "sha256": sha256_file(subject.path), "date": day, "mistyle": __version__}
     record |= {
@@ -160,13 +164,13 @@ def files_of_sheet(settings: LookSettings) -> list[str]:
     return names
 
 
-def read_subject(place: Path) -> SheetSubject:
+def read_subject(place: Path, report: Callable[[float], None] = lambda done: None) -> SheetSubject:
     """A mesh file, or a run folder's asset with the run's knowledge of the texels. Raises InputRefused."""
     from mistyle.io.read_mesh import read_mesh
     from mistyle.render.external.renderers import finished_asset
 
     path = finished_asset(place) if place.is_dir() else place
-    asset = read_mesh(path)
+    asset = read_mesh(path, progress=report)
     known = texel_knowledge(place, len(asset.mesh.parts)) if place.is_dir() else {}
     return SheetSubject(asset, path, known, reshaped(place) if place.is_dir() else None)
 
@@ -198,10 +202,44 @@ def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
     return {name: [p.astype(np.float32) for p in each] for name, each in pictures.items() if len(each) == parts}
 
 
+class Pace:
+    """The share of the time after each of several pictures (of these sizes, in this order).
+
+    The first picture of a size compiles kernels, which may take far longer than drawing it and depends on the
+    materials and on the kernels stored by earlier runs: later ones are expected to take as long as these so far.
+    """
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self._firsts = [k == 0 or size != sizes[k - 1] for k, size in enumerate(sizes)]
+        self._began = self._last = time.perf_counter()
+        self._seconds: list[float] = []
+
+    def drawn(self) -> float:
+        """Call this after every picture."""
+        now = time.perf_counter()
+        self._seconds.append(now - self._last)
+        self._last, count = now, len(self._seconds)
+        rest = 0.0
+        for kind in (True, False):
+            taken = [s for s, first in zip(self._seconds, self._firsts, strict=False) if first == kind]
+            mean = float(np.mean(taken)) if taken else self._seconds[0] / 4
+            rest += mean * self._firsts[count:].count(kind)
+        elapsed = now - self._began
+        return min(elapsed / max(elapsed + rest, 1e-9), 0.99)
+
+
 def sheet(
-    subject: SheetSubject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
+    subject: SheetSubject,
+    stage: Any,
+    rigs: Sequence[tuple[Any, np.ndarray]],
+    settings: LookSettings,
+    day: str,
+    report: Callable[[float], None],
 ) -> tuple[Sheet, int, float]:
-    """The arguments of `compose`: the sheet with its pictures, the width of its rows, and the scale of its type."""
+    """The arguments of `compose`: the sheet with its pictures, the width of its rows, and the scale of its type.
+
+    `rigs` are the lights, each with its picture of the references.
+    """
     from mistyle.render.lookdev import sheet as drawing
     from mistyle.render.lookdev.aovs import aovs
 
@@ -209,29 +247,27 @@ def sheet(
     column = drawing.column_camera(scale).size[1]
     gutter = measures(scale)["gutter"]
     width = 3 * (settings.size + column) + 2 * gutter
-    done = 0.0
+    lights = [rig for rig, _ in rigs]
+    side = panel_widths(len(drawing.CAMERAS), width, gutter)
+    step = panel_widths(LIGHT_STEPS, width, gutter)
+    pace = Pace([settings.size] * len(lights) + [side] * len(drawing.CAMERAS) + [step] * LIGHT_STEPS)
 
     def shot(azimuth: float, elevation: float, light: Any, size: int) -> np.ndarray:
-        nonlocal done
         picture = stage.picture(azimuth, elevation, light, size, settings.spp, settings.seed)
-        done += (size / settings.size) ** 2
-        report(min(done / 9, 0.99))
+        report(pace.drawn())
         return drawing.over(picture, (PANEL,) * 3)
 
     heroes = []
-    for rig in lights:
-        references = drawing.references(rig.light, settings.spp, settings.seed, scale)
+    for rig, references in rigs:
         hero = shot(*drawing.CAMERAS["3/4"], rig.light, settings.size)
         pictures = [hero, drawing.over(references, (PANEL,) * 3)[: settings.size]]
         heroes.append(Panel(beside(pictures), rig.name, f"{rig.stops:+.1f} stops"))
-    side = panel_widths(len(drawing.CAMERAS), width, gutter)
     cameras = [Panel(shot(*at, lights[0].light, side), name) for name, at in drawing.CAMERAS.items()]
     known = {name: each for name, each in subject.known.items()}
     passes = aovs(subject.asset, drawing.asset_camera(*drawing.CAMERAS["3/4"], 64), known)
     small = panel_widths(len(passes), width, gutter) // 2 * 2
     passes = aovs(subject.asset, drawing.asset_camera(*drawing.CAMERAS["3/4"], small), known)
     strip = [Panel(linear_from_srgb(on_panel(p)), name) for name, p in passes.items()]
-    step = panel_widths(LIGHT_STEPS, width, gutter)
     turned = []
     for k in range(LIGHT_STEPS):
         angle = 360 * k / LIGHT_STEPS

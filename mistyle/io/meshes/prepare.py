@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -12,11 +13,20 @@ from mistyle.core.asset import TURNED, Asset, Material, Source, UpAxis
 from mistyle.core.image import resize
 from mistyle.core.mesh import Mesh, surface_of
 from mistyle.core.names import distinct
+from mistyle.core.rows import distinct_integers
 from mistyle.geometry.normals import area_vectors, crease_normals, same_points, usable_normals
 from mistyle.geometry.raster import fragments
-from mistyle.geometry.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
+from mistyle.geometry.retexture import (
+    REPEAT,
+    Covered,
+    carry,
+    carry_corners,
+    covered_texels,
+    texel_weights,
+    turn_normals,
+)
 from mistyle.geometry.similarity import Y_FROM_Z
-from mistyle.geometry.unwrap import unwrap
+from mistyle.geometry.unwrap import estimated_seconds, unwrap
 from mistyle.geometry.upright import lies_on_its_side
 from mistyle.geometry.uvs import Layout, Verdict, arrange, signed_areas
 from mistyle.io.meshes.lookups import effective, framed, looked_up, plain_lookups
@@ -31,6 +41,7 @@ TORN = "faces that share texels have different vertex colours"
 MAX_TORN = 0.05  # largest difference (linear) of two faces' vertex colours in one texel
 PALETTE = 4  # mean texels a face, below which a texture is a palette
 FACE_TEXELS = 64  # of a palette's face after resampling
+MAPS_SECONDS = 0.5  # of a material's maps, for the progress
 SIDEWAYS = (
     "The mesh seems to lie on its side: it is tallest along z, with its base at the lower end. --up z turns it upright."
 )
@@ -119,9 +130,12 @@ def prepare(raw: Raw, path: Path, uv: UnwrapMode, up: UpAxis, size: int, progres
     if up == "y" and lies_on_its_side(raw.positions, raw.faces):
         notes.append(SIDEWAYS)
     normals = _normals(raw, work, points, work_from_user, notes)
-    plans = [_plan(raw, m, points, area, uv, path, notes) for m in range(len(raw.materials))]
-    progress(0.1)
-    fresh = _unwrap(raw, work, plans, size, lambda done: progress(0.1 + 0.8 * done))
+    plans, count, planned = [], len(raw.materials), 0.15 if raw.uvs is None or uv == "new" else 0.5
+    for m in range(count):
+        plans.append(_plan(raw, m, points, area, uv, path, notes))
+        progress(0.1 + (planned - 0.1) * (m + 1) / count)
+    share = (1 - planned) * _unwrapping(raw, plans)
+    fresh = _unwrap(raw, work, plans, size, lambda done: progress(planned + share * done))
     corner_uvs, part, names, owners = _lay_out(raw, plans, fresh)
     mesh = Mesh(
         positions=work.astype(np.float32),
@@ -138,7 +152,7 @@ def prepare(raw: Raw, path: Path, uv: UnwrapMode, up: UpAxis, size: int, progres
         )
         materials.append(part_material)
         notes.extend(part_notes)
-    progress(1.0)
+        progress(planned + share + (1 - planned - share) * (p + 1) / len(owners))
     unchanged = authored is not None and np.array_equal(corner_uvs, authored)
     uv_state = "new" if any(p.layout is None for p in plans) else "kept" if unchanged else "shifted"
     source = Source(
@@ -158,7 +172,7 @@ def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: UpAxis) -> Floa
     """Turns the axis that points up to Y, and maps the bounding sphere to the unit sphere. The sphere is centred on the
     box of vertices of non-degenerate faces."""
     turn = Y_FROM[up]
-    used = raw.positions[np.unique(raw.faces[has_area] if has_area.any() else raw.faces)] @ turn.T
+    used = raw.positions[distinct_integers(raw.faces[has_area] if has_area.any() else raw.faces)] @ turn.T
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = float(np.linalg.norm(used - centre, axis=1).max())
     if radius <= 0:
@@ -200,6 +214,8 @@ def _plan(
         notes.append(f"Material '{name}' was unwrapped anew, as requested.")
         return _Plan(rows, None, "requested")
     layout, reason = _layout(raw, raw.uvs, rows, points, area)
+    if raw.materials[material].udim and layout is not None:
+        notes.extend(_tile_notes(name, layout, bool(reason) and uv != "keep"))
     if reason and raw.authored is not None:
         authored_layout, refusal = _layout(raw, raw.authored, rows, points, area)
         if not refusal and authored_layout is not None:
@@ -248,7 +264,8 @@ def _one_colour_a_texel(raw: Raw, own: Int[np.ndarray, " n"], layout: Layout) ->
         low, high = np.full((size**2, 3), np.inf), np.full((size**2, 3), -np.inf)
         np.minimum.at(low, texel, at)
         np.maximum.at(high, texel, at)
-        covered, torn = covered + len(np.unique(texel)), torn + int(((high - low).max(axis=1) > MAX_TORN).sum())
+        covered += int(np.count_nonzero(np.bincount(texel)))
+        torn += int(((high - low).max(axis=1) > MAX_TORN).sum())
     return torn <= 0.01 * covered
 
 
@@ -267,6 +284,27 @@ def _add_notes(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes:
         notes.append(f"{mirrored:.0%} of the UV area of material '{name}' is mirrored; it was kept as authored.")
 
 
+def _tile_notes(name: str, layout: Layout, unwrapped: bool) -> list[str]:
+    """Sentences about faces that do not lie inside one tile of a material whose textures are tiles."""
+    count, tiled = len(layout.tile), (layout.tile != 1001).any()
+    if unwrapped and tiled:
+        return [f"The textures of material '{name}' are tiles; after its unwrapping only tile 1001 is shown."]
+    if layout.astray and not tiled:
+        return [
+            f"{layout.astray} of {count} faces of material '{name}' lie in no UDIM tile (u 0..10, v 0..10); all faces "
+            "show the texture of tile 1001."
+        ]
+    notes = []
+    if layout.beyond:
+        notes.append(
+            f"{layout.beyond} of {count} faces of material '{name}' reach beyond their UDIM tile; there its texture "
+            "repeats."
+        )
+    if layout.astray:
+        notes.append(f"{layout.astray} faces of material '{name}' lie in no UDIM tile; they show the nearest tile.")
+    return notes
+
+
 def _unwrap(
     raw: Raw, work: np.ndarray, plans: list[_Plan], size: int, progress: Callable[[float], None]
 ) -> dict[int, Float[np.ndarray, "n 3 2"]]:
@@ -276,6 +314,12 @@ def _unwrap(
         return {}
     meshes = [(work, raw.faces[_own(raw, plans[m].rows)]) for m in needed]
     return dict(zip(needed, unwrap(meshes, size=size, progress=progress), strict=True))
+
+
+def _unwrapping(raw: Raw, plans: list[_Plan]) -> float:
+    """The share of unwrapping in the time of unwrapping and of the materials' maps."""
+    seconds = sum(estimated_seconds(len(_own(raw, plan.rows))) for plan in plans if plan.layout is None)
+    return seconds / (seconds + MAPS_SECONDS * len(plans))
 
 
 def _own(raw: Raw, rows: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
@@ -330,8 +374,9 @@ def _material(
     notes = list(load_notes)
     rows = np.flatnonzero(mesh.part == part)
     plain = {name for name, entry in maps.items() if not all_carried and _is_plain(entry, raw.uvs, rows)}
+    covered = lru_cache(1)(partial(covered_texels, mesh.corner_uvs[rows]))  # the maps of a part often have one size
     done = {
-        name: entry.finished().values if name in plain else _placed(name, entry, raw, mesh, rows, size)
+        name: entry.finished().values if name in plain else _placed(name, entry, raw, mesh, rows, size, covered)
         for name, entry in maps.items()
     }
     carried = sorted(name for name, values in done.items() if values is not None and name not in plain)
@@ -397,8 +442,17 @@ def _tinted(
     return tint, factor
 
 
-def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, size: int) -> np.ndarray | None:
-    """One map resampled to the part's working UVs; None without lookup coordinates."""
+def _placed(
+    name: str,
+    entry: RawMap,
+    raw: Raw,
+    mesh: Mesh,
+    rows: np.ndarray,
+    size: int,
+    covered: Callable[[int], Covered],
+) -> np.ndarray | None:
+    """One map resampled to the part's working UVs, which cover the texels `covered(side)` of a square; None without
+    lookup coordinates."""
     lookup = looked_up(entry, raw.uvs, rows)
     if lookup is None:
         return None
@@ -406,7 +460,7 @@ def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, si
     entry = (framed(entry) if name == "normal" else entry).finished()
     lookup = np.clip(np.nan_to_num(lookup), -1e6, 1e6)
     side = _carried_side(entry, lookup, size)
-    values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side, wrap)
+    values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side, wrap, covered(side))
     if name == "normal":
         values = turn_normals(values, face, mesh.positions, mesh.faces[rows], lookup, mesh.corner_uvs[rows])
     return values

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -19,6 +20,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import RAW, Pixels
 from mistyle.core.errors import InputRefused
+from mistyle.geometry.uvs import SPILL
 from mistyle.io.gltf.check import load_gltf, read_json
 from mistyle.io.gltf.glb import Buffers
 from mistyle.io.images import hdr
@@ -64,13 +66,15 @@ def _usd(path: Path) -> Iterator[None]:
 
 
 def _tiles(material: RawMaterial, uvs: Float[np.ndarray, "f 3 2"] | None) -> dict[int, Tile]:
-    """The textures of every tile that may contain a face; tile 1001 where the UVs are not tiled."""
+    """The textures of every tile that may contain a face (geometry/uvs.py `nearest_tiles`); tile 1001 where the UVs are
+    not tiled."""
     numbers = {1001}
     if material.udim and uvs is not None:
-        corners = uvs[np.isfinite(uvs).all(axis=-1)]
-        u, v = np.unique(np.floor(np.clip(corners, -1, TILES)).astype(np.int64), axis=0).T
-        inside = (u >= 0) & (u < TILES) & (v >= 0) & (v < TILES)
-        numbers |= {int(n) for n in (1001 + u + 10 * v)[inside]}
+        faces = uvs[np.isfinite(uvs).all(axis=(1, 2))]
+        middles = (faces.min(axis=1) + faces.max(axis=1)) / 2
+        corners = [faces.reshape(-1, 2) + np.array(step) for step in product((-SPILL, 0, SPILL), repeat=2)]
+        u, v = np.clip(np.floor(np.concatenate([middles, *corners])), 0, TILES - 1).astype(np.int64).T
+        numbers |= {int(n) for n in 1001 + np.flatnonzero(np.bincount(u + 10 * v))}
     loaded: dict[int, Tile] = {}
     for number in sorted(numbers):
         try:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.rows import distinct_integers
 from mistyle.geometry.intersections import self_intersections
 from mistyle.geometry.normals import area_vectors
 from mistyle.solver.shape.surface import WeldedSurface
@@ -68,7 +69,7 @@ def checked_step(
             bad[new_intersections(start, surface, surface.points + now, moved).reshape(-1)] = True
         if not bad.any():
             return CheckedStep(now, int((share < 1).sum()))
-        points = np.unique(surface.faces[bad])
+        points = distinct_integers(surface.faces[bad])
         if attempt >= SPREAD:
             beside = np.isin(surface.edges, points).any(axis=1)
             points = np.union1d(points, surface.edges[beside].reshape(-1))

@@ -25,6 +25,7 @@ from scipy.spatial import KDTree
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.image import dilate, erode
 from mistyle.core.mesh import Mesh
+from mistyle.core.rows import distinct_integers
 from mistyle.render.mitsuba.draw import misses, tracer
 from mistyle.solver.shape.checks import checked_step, start_of
 from mistyle.solver.shape.outlines import Contour, Silhouette, contour_of, silhouette_of
@@ -198,7 +199,7 @@ def _target(outline: TargetOutline) -> _Target | None:
 
 def _reach(surface: WeldedSurface, rows: _Rows) -> Float[np.ndarray, " n"]:
     """How far a point lies from every outline that must move: 0 up to NEARBY, 1 from ELSEWHERE on."""
-    pulled = np.unique(rows.jacobian[rows.residual != 0].indices // 3)
+    pulled = distinct_integers(rows.jacobian[rows.residual != 0].indices // 3)
     if not len(pulled):
         return np.ones(len(surface.points))
     distance = KDTree(surface.points[pulled]).query(surface.points)[0]
@@ -228,7 +229,7 @@ def _solved(rows: _Rows, stiff: Any, basis: Any, x: Float[np.ndarray, "n 3"]) ->
     lhs = (inner.T @ sp.diags_array(rows.weight) @ inner + energy).tocsr()
     rhs = basis.T @ (weighted.T @ rows.residual)
     data = lhs.diagonal() - energy.diagonal()
-    per = 3 if inner.shape[1] == 3 * len(np.unique(basis.indices // 3)) else 1
+    per = 3 if inner.shape[1] == 3 * len(distinct_integers(basis.indices // 3)) else 1
     if per == 3:
         data = data.reshape(-1, 3).mean(axis=1)
         energy = energy.tocsr()[::3, ::3]

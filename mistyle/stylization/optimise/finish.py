@@ -21,6 +21,7 @@ from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Ambient
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
+from mistyle.core.rows import distinct_integers
 from mistyle.process import memory
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import pyramid, torch_bridge
@@ -215,7 +216,7 @@ class Finishing:
         axes = (np.repeat([c.world_from_cam[:3, k] for c in cameras], size * size, axis=0) for k in (0, 1))
         places = finish_style.places(self.painting, surface.mask, surface.position, surface.normal, *axes)
         counts = weights(surface, cameras) * places.sure
-        seen[np.unique(places.sample[counts > 0.5])] += 1
+        seen[distinct_integers(places.sample[counts > 0.5])] += 1
 
         def image(values: np.ndarray) -> "torch.Tensor":
             return torch.from_numpy(values.astype(np.float32)).reshape(n, 1, size, size)

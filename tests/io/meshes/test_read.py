@@ -204,6 +204,41 @@ def test_udim_textures(tmp_path: Path) -> None:
     assert asset.mesh.corner_uvs[2:].min() == pytest.approx(0.1, abs=1e-6)
 
 
+def test_each_material_moves_the_progress(tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    path.write_text(SQUARE + "".join(f"usemtl m{k}\nf 1/1 2/2 3/3\n" for k in range(8)))
+    done: list[float] = []
+    read_mesh(path, progress=done.append)
+    assert done == sorted(done) and done[-1] == pytest.approx(1) and len(done) >= 16
+    assert max(np.diff([0, *done])) < 0.16
+    done.clear()
+    read_mesh(path, uv="new", progress=done.append)
+    assert done == sorted(done) and done[-1] == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("left", "parts", "note"),
+    [
+        (1.0, [0, 0, 1, 1], ""),
+        (0.95, [0, 0, 1, 1], "2 of 4 faces of material 'skin' reach beyond their UDIM tile"),
+        (-9.0, [0, 0, 0, 0], "2 of 4 faces of material 'skin' lie in no UDIM tile"),
+    ],
+)
+def test_udim_islands_over_a_border(left: float, parts: list[int], note: str, tmp_path: Path) -> None:
+    for tile, colour in ((1001, (255, 0, 0)), (1002, (0, 255, 0))):
+        Image.new("RGB", (2, 2), colour).save(tmp_path / f"skin.{tile}.png")
+    (tmp_path / "m.mtl").write_text("newmtl skin\nmap_Kd skin.<UDIM>.png\n")
+    more = f"v 4 0 0\nv 4 2 0\nvt {left} 0.1\nvt 1.9 0.1\nvt 1.9 0.9\nvt {left} 0.9\n"
+    path = tmp_path / "a.obj"
+    path.write_text(SQUARE + more + "mtllib m.mtl\nusemtl skin\nf 1/1 2/2 3/3 4/4\nf 2/5 5/6 6/7 3/8\n")
+    asset = read_mesh(path)
+    notes = " ".join(asset.source.notes)
+    assert asset.mesh.part.tolist() == parts
+    assert (note in notes) and ("UDIM" in notes) == bool(note)
+    last = asset.materials[-1].albedo
+    assert last is not None and last[0, 0].tolist() == ([0, 1, 0] if parts[-1] else [1, 0, 0])
+
+
 @pytest.mark.parametrize("name", ["../secret.png", "/etc/passwd", "http://example.org/a.png", "link.png", "C:\\a.png"])
 def test_textures_outside_the_folder_are_not_read(name: str, tmp_path: Path) -> None:
     Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "secret.png")

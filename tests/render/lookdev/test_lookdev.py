@@ -15,6 +15,7 @@ from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.image import linear_from_srgb, luminance, srgb_from_linear
 from mistyle.core.light import Ambient, Environment, bake_environment
 from mistyle.deliver.lookdev import canvas as sheet_canvas
+from mistyle.deliver.lookdev import job as lookdev_job
 from mistyle.deliver.lookdev.canvas import Panel, PanelRow, Sheet, compose, fitted
 from mistyle.io.read import read_exr
 from mistyle.io.read_mesh import read_mesh
@@ -271,3 +272,19 @@ def test_a_sheet_from_the_command_line(tmp_path, ball, capsys):
     assert len(list((out / "turntable").glob("*.png"))) == 3 and not (out / "light_turn").exists()
     record = json.loads((out / "lookdev.json").read_text())
     assert record["date"] == "2026-01-02" and len(record["sha256"]) == 64 and len(record["exposure_stops"]) == 3
+
+
+@pytest.mark.parametrize("compile_seconds", [0.0, 20.0])
+def test_the_time_left_allows_for_kernels(monkeypatch, compile_seconds):
+    """Pictures of three sizes: the first of each compiles, or finds its kernels stored by an earlier run."""
+    now = [100.0]
+    monkeypatch.setattr(lookdev_job.time, "perf_counter", lambda: now[0])
+    sizes = [240] * 3 + [130] * 5 + [80] * 8
+    seconds = [1 + compile_seconds * (k in (0, 3, 8)) for k in range(16)]
+    pace = lookdev_job.Pace(sizes)
+    for k, each in enumerate(seconds[:-1]):
+        now[0] += each
+        done, elapsed, left = pace.drawn(), sum(seconds[: k + 1]), sum(seconds[k + 1 :])
+        estimate = elapsed / done - elapsed
+        assert left / 3 <= estimate <= 3 * left
+        assert k < 1 or left / 1.5 <= estimate <= 1.5 * left
