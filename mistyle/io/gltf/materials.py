@@ -22,14 +22,12 @@ from mistyle.io.gltf.infos import (
     texture_transform,
     wrap_of,
 )
-from mistyle.io.gltf.shading import GLOSSY, extension, number, shading_of, triple
+from mistyle.io.gltf.shading import DRAWN, GLOSSY, READ, extension, number, shading_of, triple
 from mistyle.io.images.read import Budget, alpha_map, alpha_of, texture
 from mistyle.io.meshes.parsed_mesh import Maps, RawMap, RawMaterial, no_textures
 from mistyle.io.sandbox.bounds import beside, read_bytes
 
 Tree = dict[str, Any]
-READ = ("KHR_materials_unlit", "KHR_materials_emissive_strength", GLOSSY)
-DRAWN = ("KHR_materials_ior", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_transmission")
 
 
 def read_material(

@@ -126,7 +126,7 @@ def finished_asset(folder: Path) -> Path:
 def left_out(source: Subject) -> list[str]:
     """glTF features that Mitsuba's side does not render: all `features` of a scene exported for other versions, else
     the material extensions, or their textures, that the reader leaves out."""
-    from mistyle.io.gltf.materials import DRAWN, READ
+    from mistyle.io.gltf.shading import DRAWN, READ
 
     if source.export:
         return features(source)

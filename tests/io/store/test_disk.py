@@ -116,7 +116,9 @@ print(json.dumps(said))
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit on the size of a file")
 def test_writers_that_hide_the_reason_are_asked_again(tmp_path):
     """A real limit: NumPy says "N requested and M written" without the system's number; the sentence names it."""
-    done = subprocess.run([sys.executable, "-c", LIMITED, str(tmp_path)], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", LIMITED, str(tmp_path)], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert set(said) == {"record", "exr", "png", "array"}
@@ -172,7 +174,7 @@ def test_compare_keeps_the_earlier_page_when_the_disk_fills(tmp_path, capsys):
         "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000));"
         "from mistyle.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
-    line = [sys.executable, "-c", code, "compare", picture, picture, "-o", str(out), "--metrics", "psnr"]
+    line = [sys.executable, "-B", "-c", code, "compare", picture, picture, "-o", str(out), "--metrics", "psnr"]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 1 and "exceeded the allowed size" in done.stderr and "Traceback" not in done.stderr, (
         done.stderr
