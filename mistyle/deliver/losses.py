@@ -11,6 +11,7 @@ from typing import Any
 from mistyle.core.asset import Material
 from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.gltf.variants import variants
+from mistyle.io.usd.contents import listed
 
 Tree = Mapping[str, Any]
 GLTF = (".glb", ".gltf")
@@ -65,7 +66,7 @@ def losses(found: Mapping[str, str], formats: Sequence[str]) -> tuple[str, ...]:
         without = [LABELS[f] for f in LABELS if f in formats and kind in LACKS[f]]
         if kind in found and without:
             verb = "lack" if len(without) > 1 or "maps" in without[0] else "lacks"
-            result.append(f"{_capital(_listed(without))} {verb} {found[kind]}, which the GLB has.")
+            result.append(f"{_capital(listed(without))} {verb} {found[kind]}, which the GLB has.")
     return tuple(result)
 
 
@@ -76,7 +77,7 @@ def source_losses(notes: Iterable[str], formats: Sequence[str]) -> tuple[str, ..
     if not without:
         return ()
     verb = "lacks" if len(without) == 1 else "lack"
-    return tuple(f"{_listed(without)} {verb} {text}, which the USD source has." for text in held)
+    return tuple(f"{listed(without)} {verb} {text}, which the USD source has." for text in held)
 
 
 def mesh_features(tree: Tree, notes: Sequence[str] = ()) -> dict[str, str]:
@@ -129,8 +130,8 @@ def surface_features(tree: Tree, materials: Sequence[Material], transparent: Seq
     }
     found = {kind: text.format(_named(those)) for kind, (those, text) in names.items() if those}
     other = [f"'{name}'" for name in dict.fromkeys(name for name, _ in variants(tree))]
-    found |= {"variants": f"all variants but the default one ({_listed(other)})"} if other else {}
-    return found | ({"extensions": _listed(further)} if further else {})
+    found |= {"variants": f"all variants but the default one ({listed(other)})"} if other else {}
+    return found | ({"extensions": listed(further)} if further else {})
 
 
 def _used(tree: Tree) -> list[tuple[str, Mapping[str, Any]]]:
@@ -159,12 +160,7 @@ def _count(tree: Tree, key: str) -> int:
 
 def _named(names: Iterable[str]) -> str:
     distinct = [f"'{name}'" for name in dict.fromkeys(names)]
-    return f"material{'s' if len(distinct) > 1 else ''} {_listed(distinct)}"
-
-
-def _listed(words: Iterable[str]) -> str:
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
+    return f"material{'s' if len(distinct) > 1 else ''} {listed(distinct)}"
 
 
 def _capital(text: str) -> str:

@@ -10,6 +10,7 @@ Tree = dict[str, Any]
 Triple = tuple[float, float, float]
 MAX_RADIANCE = 1e6
 GLOSSY = "KHR_materials_pbrSpecularGlossiness"
+# Material extensions that become maps and factors, and those whose factors only renders of the file show.
 READ = ("KHR_materials_unlit", "KHR_materials_emissive_strength", GLOSSY)
 DRAWN = ("KHR_materials_ior", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_transmission")
 

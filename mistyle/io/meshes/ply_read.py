@@ -253,12 +253,12 @@ def _ply_ascii(data: bytes, elements: list[_PlyElement], path: Path) -> tuple[di
     try:
         return _ply_columns(numbers, elements, path), []
     except InputRefused:
-        rows = [row for row in data.splitlines() if row.strip()]
+        rows = [row.split() for row in data.splitlines() if row.strip()]
         if len(rows) != sum(element.count for element in elements):
             raise
     described = [element for element in elements for _ in range(element.count)]
-    kept = [_described(row.split(), element, path) for row, element in zip(rows, described, strict=True)]
-    longer = sum(len(row.split()) > len(own) for row, own in zip(rows, kept, strict=True))
+    kept = [_described(row, element, path) for row, element in zip(rows, described, strict=True)]
+    longer = sum(len(row) > len(own) for row, own in zip(rows, kept, strict=True))
     tables = _ply_columns(
         parse_numbers(b" ".join(token for own in kept for token in own), path, "its data"), elements, path
     )

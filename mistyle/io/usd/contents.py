@@ -1,7 +1,7 @@
 """The contents of a USD stage that an asset of mistyle cannot hold: skins, animations, variants, cameras and lights."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 MOVING = ("moving prims", "moving skeletons", "moving shapes")
@@ -22,14 +22,14 @@ def unheld_notes(pxr: Any, stage: Any) -> list[str]:
     words = {
         "skin": "a skin and its skeleton" if counts["skeleton"] < 2 else f"skins with {counts['skeleton']} skeletons",
         "blend shapes": f"blend shapes ({counts['blend shapes']})",
-        "animation": f"an animation ({_listed([f'{k}: {counts[k]}' for k in MOVING if counts[k]])})",
+        "animation": f"an animation ({listed([f'{k}: {counts[k]}' for k in MOVING if counts[k]])})",
         "cameras": f"cameras ({counts['cameras']})",
         "lights": f"lights ({counts['lights']})",
     }
     held = [text for kind, text in words.items() if counts[kind]]
     if sets:
-        held.append(f"further variants of {_listed([repr(name) for name in sets])}")
-    return [f"The USD file has {_listed(held)}, which the asset lacks."] if held else []
+        held.append(f"further variants of {listed([repr(name) for name in sets])}")
+    return [f"The USD file has {listed(held)}, which the asset lacks."] if held else []
 
 
 def _kinds(pxr: Any, prim: Any) -> list[str]:
@@ -55,6 +55,7 @@ def _kinds(pxr: Any, prim: Any) -> list[str]:
     return kinds
 
 
-def _listed(words: Sequence[str]) -> str:
-    *first, last = words or [""]
+def listed(words: Iterable[str]) -> str:
+    """The words as part of a sentence: "a, b and c"; "" for none."""
+    *first, last = [*words] or [""]
     return f"{', '.join(first)} and {last}" if first else last

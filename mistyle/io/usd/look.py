@@ -202,7 +202,8 @@ def _bind(
         rest, of_subset = own
         _bound(pxr, stage, prim, names[parts[0] if rest is None else rest])
         for subset, k in zip(subsets, of_subset, strict=True):
-            _bound(pxr, stage, subset.GetPrim(), names[k]) if k is not None else None
+            if k is not None:
+                _bound(pxr, stage, subset.GetPrim(), names[k])
         if subsets and api(prim).GetMaterialBindSubsetsFamilyType() == pxr.UsdGeom.Tokens.unrestricted:
             api(prim).SetMaterialBindSubsetsFamilyType(pxr.UsdGeom.Tokens.nonOverlapping)
         return
